@@ -21,7 +21,7 @@ sys.modules["rfc3987_syntax"] = None
 
 # The same examples on every machine; --hypothesis-profile=explore looks for new ones.
 settings.register_profile(
-    "steady", derandomize=True, deadline=None, max_examples=50, database=None,
+    "steady", derandomize=True, deadline=None, max_examples=25, database=None,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
 settings.register_profile("explore", settings.get_profile("steady"), derandomize=False, max_examples=1000)
@@ -134,6 +134,16 @@ def client():
     options = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.Client(**options, set_as_default=False) as client:
         yield client
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Pages without pictures for paper and without Vega, where a test reads the rest of them: those take seconds."""
+    from lathe_rc.drawing import charts
+
+    monkeypatch.setattr(charts, "library", str)
+    monkeypatch.setattr(charts.Charts, "png", lambda *_: b"")
+    monkeypatch.setattr(charts.Charts, "picture", lambda *_: "")
 
 
 @pytest.fixture

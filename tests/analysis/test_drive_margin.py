@@ -244,6 +244,7 @@ def test_measured_drive_with_which_the_loop_diverges_is_refused_with_a_cure(tmp_
         Cell(cell_of(*compound).nodes).check()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_bag_holds_the_measured_points_for_a_resimulation(tmp_path):
     """Whatever the name of the file, whose content alone is in the bag; its loop is that of the report's figure."""
     measured(tmp_path / "points.txt", 2.0)

@@ -62,9 +62,9 @@ def brute_force(cell, modes):
 
 @pytest.mark.parametrize("law", LAWS)
 def test_margins_with_narrow_modes_are_those_of_brute_force(law):
-    """Of 51 random drives with one to three modes of dampings down to 1e-5, within 1 %."""
+    """Of 18 random drives with one to three modes of dampings down to 1e-5, within 1 %."""
     rng = np.random.default_rng(list(LAWS).index(law))
-    for _ in range(17):
+    for _ in range(6):
         count = int(rng.integers(1, 4))
         zeta = 10.0 ** rng.uniform(-5.0, -2.0, count)
         parts = rng.choice([-1.0, 1.0], count) * 2.0 * zeta * 10.0 ** rng.uniform(-2.0, 0.0, count)

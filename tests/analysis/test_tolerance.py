@@ -155,6 +155,7 @@ def test_a_run_without_a_revolution_is_not_in_tolerance():
     assert "not in tolerance (±2 µm): no complete revolution" in done.stderr
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_terminal_json_and_report_say_alike_that_a_run_diverges_though_it_is_in_tolerance(tmp_path):
     """A lead that is too long: the form error falls, then grows, within a wide tolerance."""
     lead = ("--set", "learning_controller.lead_time=3e-3", "--set", "learning_controller.allow_unstable=true")
@@ -177,6 +178,7 @@ def test_terminal_json_and_report_say_alike_that_a_run_diverges_though_it_is_in_
     ("tolerance", "mood", "said", "options"),
     [(2e-6, "good", "in tolerance", ["--budget"]), (0.1e-6, "bad", "not in tolerance", [])],
 )
+@pytest.mark.usefixtures("no_pictures")
 def test_a_report_begins_with_it_and_shows_the_budget_if_it_is_asked_for(tmp_path, tolerance, mood, said, options):
     cell = scenario(spindle_encoder={"revolutions": 5.0}, tool={"tolerance": tolerance})
     harness.run(cell, bag=tmp_path / "bag")
@@ -235,6 +237,7 @@ def by_hand(recording, tolerances):
     return found
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_zones_are_judged_each_by_its_tolerance(tmp_path):
     """Result, JSON, report and row of a sweep agree with the samples; a zone without a tolerance is named."""
     changes = ["spindle_encoder.revolutions=8", "tool.tolerance=2e-6", *ZONES]

@@ -43,15 +43,16 @@ def refused(said):
 BOMB = zstandard.compress(bytes(MOST_BYTES + 1))
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.system) if TARGETS[name].slow else name for name in TARGETS]
-)
+EACH = [pytest.param(name, marks=pytest.mark.system) if TARGETS[name].slow else name for name in TARGETS]
+
+
+@pytest.mark.parametrize("name", EACH)
 def test_what_is_valid_is_read(name):
     for data in TARGETS[name].seeds():
         TARGETS[name].read(data)
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("name", EACH)
 def test_damage_is_refused_in_a_line(name):
     @settings(max_examples=2 if TARGETS[name].slow else 30)
     @given(st.randoms(use_true_random=False))

@@ -102,6 +102,7 @@ def files(folder: Path, *suffixes: str) -> str:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
+@pytest.mark.usefixtures("no_pictures")
 def test_no_command_states_a_figure_that_rests_on_held_samples(words, code, lost, whole, tmp_path):
     """Held samples appear in no output and in no file; each command names the loss, and none ends with exit code 0."""
     done = lathe(*(word.format(bag=lost, whole=whole, out=tmp_path) for word in words))

@@ -106,7 +106,7 @@ RUNS = st.builds(
 
 
 @given(run=RUNS, data=st.data())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_no_arrival_changes_the_bag(tmp_path_factory, run, data):
     """A bag is the same whoever is heard first, and whether blocks come as bytes or as arrays.
 
@@ -127,7 +127,7 @@ def test_no_arrival_changes_the_bag(tmp_path_factory, run, data):
 
 
 @given(run=RUNS, chunk=st.integers(1, 30))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_many_blocks_at_once_are_the_same_bag(tmp_path_factory, run, chunk):
     path = tmp_path_factory.mktemp("order") / "bag"
     writer, merger = run.begin(path)
@@ -148,7 +148,7 @@ def test_many_blocks_at_once_are_the_same_bag(tmp_path_factory, run, chunk):
 
 
 @given(run=RUNS, share=st.floats(0, 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_an_interrupted_run_keeps_what_came(tmp_path_factory, run, share):
     path = tmp_path_factory.mktemp("order") / "bag"
     writer, merger = run.begin(path)

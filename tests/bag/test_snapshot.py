@@ -14,7 +14,7 @@ import pytest
 import rclpy
 import yaml
 from bags import QOS, lathe, storage_of
-from cells import files_up_to, scenario
+from cells import all_but, files_up_to, in_two, scenario
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from machines import assert_refused
@@ -81,8 +81,8 @@ def rows(first, last):
 
 @pytest.fixture(scope="module", params=["offline", "processes"])
 def recorded(request, tmp_path_factory):
-    bag = tmp_path_factory.mktemp(request.param) / "bag"
-    return harness.run(cell(mode="both"), mode=request.param, groups=[], bag=bag)
+    bag, both = tmp_path_factory.mktemp(request.param) / "bag", cell(mode="both")
+    return harness.run(both, mode=request.param, groups=in_two(both), bag=bag)
 
 
 @pytest.fixture(scope="module")
@@ -230,10 +230,10 @@ def ask(ghost):
 
 
 def test_service_makes_a_snapshot_and_an_interrupted_run_leaves_one(ghost, domain, tmp_path):
-    running = cell([], 100.0, 0.5, mode="snapshot")
-    expected = read(harness.run(cell([], 100.0), bag=tmp_path / "whole").bag)
+    running = cell([], 40.0, 0.2, mode="snapshot")
+    expected = read(harness.run(cell([], 40.0), bag=tmp_path / "whole").bag)
     complete = harness.with_recorder(running, tmp_path / "bag", keep=True)
-    with harness.Processes(complete, [[name] for name in complete.nodes], domain=domain) as processes:
+    with harness.Processes(complete, all_but(complete, "recorder"), domain=domain) as processes:
         processes.wait_for("cycle")
         success, answer = ask(ghost)
         assert success
@@ -286,7 +286,7 @@ def test_a_killed_node_leaves_the_last_seconds(node, tmp_path, whole):
     asked = {"events": ["sample 9000: freeze"], "post": 100.0} if node == "recorder" else {"events": []}
     running = cell(**asked, revolutions=2000.0, mode="snapshot", chunk_size=4096)
     with pytest.raises(LatheError, match=f"^{node} was killed by SIGKILL"):
-        harness.run(running, mode="processes", groups=[], bag=tmp_path / "bag", watch=kill)
+        harness.run(running, mode="processes", groups=all_but(running, node), bag=tmp_path / "bag", watch=kill)
     (path,) = (tmp_path / "bag_snapshots").iterdir()
     found = told(path)
     assert found["whole"] is (node == "tool")

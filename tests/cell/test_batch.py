@@ -10,7 +10,7 @@ from functools import cache, cached_property
 
 import numpy as np
 import pytest
-from cells import SCENARIOS
+from cells import every_scenario
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from machines import line_of
@@ -80,7 +80,7 @@ def test_each_cell_has_the_digests_that_it_has_alone_whatever_ran_before(kinds, 
         assert (why(outcome.error) if outcome.error else outcome.kept.digests()) == alone(kind)
 
 
-@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", every_scenario())
 def test_stages_of_all_kinds_are_set_back(path):
     """A cell that runs again and again on a runner gives the same, though its stages are made once or twice."""
     runner, told, stages = batch.CellRunner(), [], []

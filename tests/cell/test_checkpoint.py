@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import lathe, sized, some
+from cells import in_two
 from test_restart import OWN, Killer
 
 import lathe_rc
@@ -48,7 +49,7 @@ def gone_on(name: str, folder: Path, count: int, seed: int = 1, modes: Sequence[
     whole = lathe_rc.run(scenario, checkpoints={f"sample:{place}": folder / f"{place}" for place in places})
     assert whole.digest == lathe_rc.run(scenario).digest, "checkpoints change nothing"
     for place, mode in product(places, modes):
-        found = lathe_rc.run(scenario, mode=mode, start_from=folder / f"{place}")
+        found = lathe_rc.run(scenario, mode=mode, groups=in_two(scenario), start_from=folder / f"{place}")
         assert (found.recording.first, found.samples) == (place, samples - place)
         assert found.digest == rest(whole.recording, place), f"{name} from sample {place}, {mode}"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cells import of_nodes
+from cells import in_two, of_nodes
 from machines import line_of
 
 from lathe_papers import cells
@@ -28,7 +28,7 @@ def error(result):
 def test_processes_give_the_digests_of_the_offline_run(structure):
     """Processes give the offline bits also with a channel more, or a drive that compensates within the sample."""
     loaded = cells.load(structure, **SHORT)
-    offline, processes = harness.run(loaded), harness.run(loaded, mode="processes")
+    offline, processes = harness.run(loaded), harness.run(loaded, mode="processes", groups=in_two(loaded))
     assert processes.digest == offline.digest
     assert offline.dropped == processes.dropped == 0
 

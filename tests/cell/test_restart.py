@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
+from cells import all_but
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lathe_rc_msgs.srv import Schedule
@@ -87,7 +88,7 @@ def test_a_controller_goes_on_from_its_kept_state_to_the_bit(law, tmp_path):
     assert np.array_equal(long, plain[: long.size])
     assert told == said[: len(told)]
 
-    @settings(max_examples=6)
+    @settings(max_examples=3)
     @given(st.sets(st.integers(0, samples(recording) // BLOCK - 1), max_size=8))
     def check(keep_at):
         again, told = commands(cell, recording, keep_at, tmp_path / "state")
@@ -124,7 +125,7 @@ def test_a_killed_controller_goes_on_in_another_process_to_the_bit(tmp_path):
     kept += ["spindle_encoder.speed_factor=0.5"]  # on a busy machine, the run must not end before the second kill
     kept += [f"{OWN}.events=['sample 9000: clear', 'sample 9000: clear']"]  # equal messages that are no repeats
     cell, killer = load(CONFIG / "supervised.yaml", kept), Killer(OWN, [15_000, 40_000])
-    result = harness.run(cell, mode="processes", bag=tmp_path / "bag", watch=killer)
+    result = harness.run(cell, mode="processes", groups=all_but(cell, OWN), bag=tmp_path / "bag", watch=killer)
     assert result.digest == harness.run(cell).digest
     assert reader.read_bag(tmp_path / "bag").digests() == result.digest
     assert check_bag(tmp_path / "bag").exit_code == 0
@@ -140,7 +141,7 @@ def test_an_event_that_was_asked_for_is_kept_when_a_state_of_before_is_written(g
     cell = load(CONFIG / "piston.yaml", [*kept, "spindle_encoder.speed_factor=0.5"])  # else it may end before DDS tells
     client = ghost.create_client(Schedule, f"/{OWN}/schedule")
     recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
-    with harness.Processes(recorded, [[name] for name in recorded.nodes], domain=domain) as processes:
+    with harness.Processes(recorded, all_but(recorded, OWN), domain=domain) as processes:
         assert client.wait_for_service(20.0)
         processes.wait_for("cycle")
         future = client.call_async(Schedule.Request(action="freeze"))

@@ -6,13 +6,13 @@ import itertools
 import os
 import signal
 
-from cells import scenario
+from cells import all_but, scenario
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from lathe_rc import harness, messages
 
-LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 60.0, "speed_factor": 1.0})  # there for 3.6 s
+LEFT = scenario({"run_id": "left"}, spindle_encoder={"revolutions": 10.0, "speed_factor": 0.2})  # there for 3 s
 RIGHT = scenario(
     {"run_id": "right", "nominal_rpm": 1100.0, "block_size": 128},
     spindle_encoder={"revolutions": 6.0},
@@ -53,8 +53,9 @@ class Pause:
 def test_a_cell_lives_in_the_middle_of_another(domain, tmp_path):
     pause, options = Pause("tool"), {"mode": "processes", "domain": domain}
     with concurrent.futures.ThreadPoolExecutor() as pool:
+        groups = all_but(LEFT, "tool")
         left = pool.submit(
-            harness.run, LEFT, **options, namespace="/left", bag=tmp_path / "left", watch=pause, groups=[]
+            harness.run, LEFT, **options, namespace="/left", bag=tmp_path / "left", watch=pause, groups=groups
         )
         concurrent.futures.wait([left, pause.stopped], return_when=concurrent.futures.FIRST_COMPLETED)
         right = harness.run(RIGHT, **options, namespace="/shop/right", bag=tmp_path / "right", groups=[[*RIGHT.nodes]])

@@ -243,7 +243,7 @@ FORMS = {
 
 
 @pytest.mark.parametrize("name", FORMS)
-@pytest.mark.parametrize("points", [180, 360, 720, 1440])
+@pytest.mark.parametrize("points", [180, 1440])
 def test_no_real_form_stands_out(name, points):
     """Edges, keyways, grooves, kinks, and waves above those that are fitted, with noise or without."""
     random = np.random.default_rng(points)
@@ -373,7 +373,7 @@ def test_five_parts_bring_57_micrometres_below_one_under_noise_of_a_third_of_one
     """Each part is clamped at another angle in a gauge of 0.3 µm of noise; the correlation finds the angle."""
     random, told, largest = np.random.default_rng(11), [], []
     for part in range(1, 6):
-        result = harness.run(config("gauged", BLIND, "spindle_encoder.revolutions=30.0", *told))
+        result = harness.run(config("gauged", BLIND, "spindle_encoder.revolutions=12.0", *told))
         largest.append(result.errors.largest[-1])
         record = gauge_part(tmp_path / "record.csv", result, desired, random, turned=random.uniform(0, TURN))
         sets = [word for each in told for word in ("--set", each)]

@@ -85,7 +85,7 @@ def test_filter_without_a_deviation_finds_the_middle_of_the_counts():
     assert_allclose(late, -0.5, rtol=0.05)
 
 
-@pytest.mark.parametrize("counts", [1000, 2048, 3500, 4096, 7000])
+@pytest.mark.parametrize("counts", [1000, 3500, 4096])
 @pytest.mark.parametrize("frequency", [20.0, 300.0])
 def test_edge_times_make_every_count_as_good_as_fifty_thousand(counts, frequency):
     law = speed.harmonic(NOMINAL, np.array([0.1]), np.array([frequency]), np.zeros(1), 0.1)

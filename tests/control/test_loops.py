@@ -224,6 +224,7 @@ def shown(folder, *words):
 
 
 @pytest.mark.parametrize(("name", "mood"), [("calm", "good"), ("wild", "bad")])
+@pytest.mark.usefixtures("no_pictures")
 def test_a_report_judges_and_draws_a_loop_as_the_run_does(turned, tmp_path, name, mood):
     page = shown(tmp_path, "report", turned.folder / name)
     loop = turned.results[name].loops["force_controller"]
@@ -238,6 +239,7 @@ def test_a_report_judges_and_draws_a_loop_as_the_run_does(turned, tmp_path, name
     assert "No form to" not in page.text
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_comparison_shows_the_loops_of_runs_without_a_part(turned, tmp_path):
     page = shown(tmp_path, "compare", turned.folder / "calm", turned.folder / "wild")
     rows = page.rows("Force and position")

@@ -241,6 +241,7 @@ def test_two_sweeps_are_compared_by_their_common_cells(piston, client, tmp_path)
     assert f"lathe sweep show {tmp_path / 'b'} --cell {found.sides[1].best['cell']} --panel" in shown.stdout
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_cell_gives_its_bag_and_its_report_in_one_command(piston, client, tmp_path):
     lathe_explore.run_sweep(piston, Space(grid={LEAD: [1.3e-3]}), tmp_path / "rows", client=client)
     shown = CliRunner().invoke(main, ["sweep", "show", str(tmp_path / "rows"), "--cell", "0", "--report"])

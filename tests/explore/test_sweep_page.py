@@ -77,12 +77,6 @@ def no_library(monkeypatch):
     monkeypatch.setattr(charts, "library", lambda: "")
 
 
-@pytest.fixture
-def no_pictures(monkeypatch):
-    """Draw no PNGs: where other tests draw the same figures, they only take seconds."""
-    monkeypatch.setattr(charts.Charts, "png", lambda *_: b"")
-
-
 class TestEffects:
     def ishigami(self, count=4096):
         """Points of a sample, and the values of Ishigami's function (a = 7, b = 0.1) there."""

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from cells import Seen, held, scenario, until
+from cells import Seen, all_but, held, scenario, until
 
 pytest.importorskip("rclpy")
 
@@ -120,7 +120,7 @@ def test_a_running_cell_survives_what_is_started_beside_it(ghost, domain, tmp_pa
 def test_a_member_that_is_ended_before_the_run_is_named_and_the_others_end(node, number, at, tmp_path):
     """A signal may come before the process handles signals, and before its node has heard of the cell."""
     cell = harness.with_recorder(scenario(), tmp_path / "bag", keep=True)
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+    with harness.Processes(cell, all_but(cell, node)) as processes:
         if at:
             processes.wait_for(at, node)
         os.kill(processes.pids[node], number)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from cells import scenario
+from cells import in_two, scenario
 
 from lathe_rc import harness
 from lathe_rc.nodes import dds
@@ -54,7 +54,7 @@ def test_shared_memory_is_the_users_choice(wanted, shared, monkeypatch):
             maps = Path(f"/proc/{pids[event['node']]}/maps").read_text(encoding="utf-8")
             segments.add("/fastrtps_" in maps)
 
-    assert harness.run(cell, mode="processes", watch=look).digest == harness.run(cell).digest
+    assert harness.run(cell, mode="processes", groups=in_two(cell), watch=look).digest == harness.run(cell).digest
     assert segments == {shared}
 
 

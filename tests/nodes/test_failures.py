@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
-from cells import refusals, told_until_all_have_ended
+from cells import all_but, refusals, told_until_all_have_ended
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
@@ -105,7 +105,7 @@ def test_the_death_of_a_member_ends_in_the_safe_state(node, tmp_path):
     with pytest.raises(
         LatheError, match=rf"^{node} was killed by SIGKILL; /{node} died: safe state from sample \d+ on$"
     ):
-        harness.run(scenario, mode="processes", bag=bag, watch=watch)
+        harness.run(scenario, mode="processes", groups=all_but(scenario, node), bag=bag, watch=watch)
     (safe,) = [event for event in events if event["event"] == "safe"]
     assert safe["lost"] == [f"/{node}"]
     assert safe["end"] == safe["sample"] + 6400
@@ -171,7 +171,7 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
     Under ros2 launch or by hand nobody ends them: they see that no sample follows, and the bag is closed.
     """
     cell = harness.with_recorder(load(PISTON, RUN), tmp_path / "bag", keep=True)
-    with harness.Processes(cell, [[name] for name in cell.nodes]) as processes:
+    with harness.Processes(cell, all_but(cell, "spindle_encoder", "recorder")) as processes:
         processes.wait_for("cycle")
         os.kill(processes.pids["spindle_encoder"], signal.SIGKILL)
         told = told_until_all_have_ended(processes)
@@ -185,7 +185,7 @@ def test_without_the_harness_the_members_leave_when_their_time_master_is_gone(tm
     assert not check(tmp_path / "bag").wrong
 
 
-@pytest.mark.parametrize("mode", [pytest.param("composed", marks=pytest.mark.system), "processes"])
+@pytest.mark.parametrize("mode", ["composed", pytest.param("processes", marks=pytest.mark.system)])
 def test_a_bag_that_cannot_be_closed_is_a_failure_in_every_host(mode, tmp_path, monkeypatch):
     """A bag that cannot be closed is a failure in every host, also when all others have ended well."""
     (tmp_path / "sitecustomize.py").write_text(FULL_AT_THE_END, encoding="utf-8")
@@ -198,11 +198,12 @@ def test_a_bag_that_cannot_be_closed_is_a_failure_in_every_host(mode, tmp_path, 
 
 @pytest.mark.parametrize(
     ("number", "mode"),
-    [(signal.SIGINT, "processes"), pytest.param(signal.SIGTERM, "composed", marks=pytest.mark.system)],
+    [(signal.SIGINT, "composed"), pytest.param(signal.SIGTERM, "processes", marks=pytest.mark.system)],
 )
 def test_the_command_closes_its_bag_on_a_signal(number, mode, tmp_path):
     bag = tmp_path / "bag"
     command = [sys.executable, "-m", "lathe_rc", "run", str(PISTON), "--mode", mode, "--bag", str(bag)]
+    command += ["--group", "learning_controller+electrodynamic_actuator+tool"] if mode == "processes" else []
     with subprocess.Popen([*command, "--speed-factor", "1.0"], stderr=subprocess.PIPE) as process:
         first = process.stderr.readline()
         assert first.startswith(b"revolution 1: "), first

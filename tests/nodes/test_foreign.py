@@ -118,7 +118,7 @@ BOTH = ["learning_controller", "electrodynamic_actuator"]
 @pytest.mark.parametrize(
     ("foreign", "together"),
     [
-        (["electrodynamic_actuator"], ["tool", "recorder"]),
+        pytest.param(["electrodynamic_actuator"], ["tool", "recorder"], marks=pytest.mark.system),
         ([*BOTH, "listener"], ["spindle_encoder", "tool"]),
     ],
 )

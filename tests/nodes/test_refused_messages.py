@@ -96,7 +96,7 @@ def diagnostics(bag):
 
 def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
     """Foreign messages are refused, counted and named, and the cell gives the bits that it has alone."""
-    cell = scenario(spindle_encoder={"revolutions": 60.0, "speed_factor": 1.0})  # while all is said several times
+    cell = scenario(spindle_encoder={"revolutions": 12.0, "speed_factor": 0.2})  # while all is said several times
     on = {"/encoder": (EncoderBlock, "/spindle_encoder"), "/tool": (ToolBlock, "/tool")}
     sends = []
     for topic, (kind, own) in on.items():
@@ -115,7 +115,7 @@ def test_a_cell_goes_on_among_foreign_messages(ghost, domain, tmp_path):
         (states, CellState(run_id="x", state=CellState.FAILED)),
         (progress, Progress(run_id="x", name="/tool", blocks=2**40)),
         (progress, Progress(run_id="test", name="/made_up", blocks=2**40)),
-        *((joints, joint_state(sample)) for sample in range(100, 120_000, 10_000)),
+        *((joints, joint_state(sample)) for sample in range(100, 46_080, 4_000)),
     ]
     expected = set.union(*(senders(topic, own) for topic, (_, own) in on.items())) | {
         "/electrodynamic_actuator of run 'test' on /electrodynamic_actuator/joint_states",
@@ -158,11 +158,12 @@ def test_a_cell_begins_in_a_flood_of_announcements(ghost, domain, tmp_path):
     assert processes.refused["/x of run 'elsewhere' on /members"] > 256
 
 
+@pytest.mark.system
 def test_nobody_speaks_in_the_name_of_a_member(ghost, domain, tmp_path):
     """A block, announcement, state, progress or joint state is from the node that DDS names, or it is refused."""
     # Long enough for all nodes to discover all publishers of the ghost while other tests keep the machine busy.
-    cell = scenario(spindle_encoder={"revolutions": 120.0, "speed_factor": 1.0})
-    joints = [(sample, joint_state(sample)) for sample in range(0, 120_000, 640)]
+    cell = scenario(spindle_encoder={"revolutions": 24.0, "speed_factor": 0.2})
+    joints = [(sample, joint_state(sample)) for sample in range(0, 92_160, 640)]
     forged = {
         "/members": (Member, [Member(run_id="test", name="/tool", state=Member.FAILED, message="no")]),
         "/cell_state": (
@@ -171,7 +172,7 @@ def test_nobody_speaks_in_the_name_of_a_member(ghost, domain, tmp_path):
         ),
         "/progress": (Progress, [Progress(run_id="test", name="/tool", blocks=2**40)]),
         "/electrodynamic_actuator/joint_states": (JointState, [message for _, message in joints]),
-        "/tool": (ToolBlock, [block(messages.TOOL, first, "/tool", "test") for first in range(0, 120_000, 64)]),
+        "/tool": (ToolBlock, [block(messages.TOOL, first, "/tool", "test") for first in range(0, 92_160, 64)]),
     }
     sends = []
     for topic, (kind, those) in forged.items():
@@ -179,7 +180,7 @@ def test_nobody_speaks_in_the_name_of_a_member(ghost, domain, tmp_path):
         sends += [(publisher, each) for each in those]
     recorded = harness.with_recorder(cell, tmp_path / "bag", keep=True)
     nodes = [[name] for name in recorded.nodes]
-    with all_the_time(sends, 0.0002), harness.Processes(recorded, nodes, domain=domain) as processes:
+    with all_the_time(sends, 0.001), harness.Processes(recorded, nodes, domain=domain) as processes:
         processes.wait_for_end()
     assert reader.read_bag(tmp_path / "bag").digests() == harness.run(cell).digest
     on = {sender.rpartition(" on ")[2] for sender in processes.refused}

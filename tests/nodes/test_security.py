@@ -303,6 +303,7 @@ def ros(enclave, *options):
 ENDLESS = ["spindle_encoder.revolutions=0.0", "spindle_encoder.speed_factor=0.05"]
 
 
+@pytest.mark.system
 def test_a_namespaced_cell_in_groups_and_those_that_listen_to_it(observer, tmp_path):
     """A cell in groups and those that listen to it use what their policy allows, and nothing else."""
     rerun = [RERUN_BRIDGE] if importlib.util.find_spec("rerun") else []

@@ -30,7 +30,9 @@ ORDER = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("settings", [{}, {"wd": 40, "harmonic": 4, "amplitude_um": 60}])
+@pytest.mark.parametrize(
+    "settings", [{}, pytest.param({"wd": 40, "harmonic": 4, "amplitude_um": 60}, marks=pytest.mark.system)]
+)
 def test_ordering_of_the_laws_holds_at_every_frequency(settings):
     found = study("speed-deviation", **settings)
     assert set(found) == {"wd", "max_um", "rms_um"}
@@ -71,7 +73,11 @@ def test_table_of_paper_001(correction):
 
 @pytest.mark.parametrize(
     ("samples", "low", "high"),
-    [(128, 0.05, 0.13), (512, 1e-4, 0.013), pytest.param(2048, 1e-6, 7e-4, marks=pytest.mark.system)],
+    [
+        (128, 0.05, 0.13),
+        pytest.param(512, 1e-4, 0.013, marks=pytest.mark.system),
+        pytest.param(2048, 1e-6, 7e-4, marks=pytest.mark.system),
+    ],
 )
 def test_coarse_sampling_errs_as_the_spec_says(samples, low, high):
     """Coarse sampling errs by no more than 13 % at 128 samples per revolution, 1.3 % at 512, .07 % at 2048.

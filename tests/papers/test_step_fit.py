@@ -71,7 +71,7 @@ orders = st.floats(np.log(20.0), np.log(5000.0)).map(np.exp)
 
 
 @given(orders, st.floats(0.15, 4.0), st.floats(0.02, 1.5))
-@settings(max_examples=40)
+@settings(max_examples=20)
 def test_second_order_with_delay_is_recovered(wn, damping, part):
     true = SecondOrder(wn, damping, part / wn)
     slowest = wn * (damping - np.sqrt(max(damping**2 - 1, 0.0)))

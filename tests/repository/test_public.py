@@ -30,7 +30,8 @@ EXAMPLES = {
     name: getattr(package, name) for package in PACKAGES for name in sorted({*package.__all__} - SHOWN_ELSEWHERE)
 }
 EXAMPLES |= {"Scenario.varied": Scenario.varied, "Recording.frame": Recording.frame}
-WITH_WORKERS = {"run_sweep", "tune"}  #: start processes of Dask, of which test_sweep.py and test_tune.py have none
+#: start processes, of Dask (test_sweep.py and test_tune.py have none) or of cells (test_extending.py has those)
+WITH_PROCESSES = {"run_sweep", "tune", "digests_by_host"}
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("lathe_rc/templates/*/*.j2"), ROOT / "README.md"])
 
 
@@ -42,8 +43,9 @@ def test_the_public_names_are_few_and_can_be_imported():
         lathe_rc.lode  # noqa: B018 - it is not there
 
 
+@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.system if name in WITH_WORKERS else ()) for name in EXAMPLES]
+    "name", [pytest.param(name, marks=pytest.mark.system if name in WITH_PROCESSES else ()) for name in EXAMPLES]
 )
 def test_the_example_in_its_help_runs(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -124,6 +124,7 @@ def test_a_verdict_needs_room_for_the_doubt(doubted, said, in_tolerance):
     assert found.in_tolerance == in_tolerance
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_run_json_and_report_tell_the_doubt(tmp_path):
     """A twisted form whose heights are too far apart is not in tolerance, though the error to its table is small."""
     tabulated = table(twist(np.pi / 2), 90, even(0.25, 2.0))

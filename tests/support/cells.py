@@ -50,6 +50,17 @@ def scenario(shared: Values | None = None, **nodes: Values) -> Scenario:
     return Scenario("test", tables)
 
 
+def all_but(cell: Scenario, *alone: str) -> list[list[str]]:
+    """Processes of a cell: one for each of some nodes, and one for all others, since each takes time to start."""
+    return cell.processes([[name for name in cell.nodes if name not in alone]])
+
+
+def in_two(cell: Scenario) -> list[list[str]]:
+    """Two processes of a cell, with neighbours of its file in different ones."""
+    names = list(cell.nodes)
+    return [names[::2], names[1::2]]
+
+
 def listening(group: int) -> list[str]:
     """Local addresses at which a group of processes listens, as /proc/net has them."""
     sockets = set()

@@ -8,6 +8,7 @@ import signal
 import numpy as np
 import pytest
 from bags import lathe, sized, some
+from cells import all_but
 
 from lathe_rc import harness, load, read_bag
 from lathe_rc.errors import LatheError
@@ -53,7 +54,9 @@ def test_a_campaign_of_kills_leaves_no_figure_on_held_samples(name, node, undist
         bag = tmp_path / f"bag{number}"
         cell = load(name, [f"spindle_encoder.revolutions={ENDLESS}", "spindle_encoder.safe_time=0.05"])
         with pytest.raises(LatheError, match="was killed by SIGKILL"):
-            harness.run(cell, mode="processes", groups=[], bag=bag, watch=Killer(node, instant))
+            harness.run(
+                cell, mode="processes", groups=all_but(cell, node, "recorder"), bag=bag, watch=Killer(node, instant)
+            )
         recording = read_bag(bag)
         count = min(recording.samples, whole.samples)
         for topic, signals in recording.dense.items():

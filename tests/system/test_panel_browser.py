@@ -413,7 +413,7 @@ def _stepped_at_random(browser, driver, cell, choice):
 def test_the_page_shows_the_state_of_the_supervisor_in_a_campaign_of_random_commands(tmp_path):
     """After each command and fault; also the verdict of `lathe run`, and whether a reset is carried out or refused."""
     states = set()
-    for seed in range(sized(100)):
+    for seed in range(sized(50)):
         cell = LiveCell(load(SUPERVISED, ["spindle_encoder.revolutions=120"]))
         folder = tmp_path / str(seed)
         folder.mkdir()

@@ -11,7 +11,7 @@ from bags import sized
 from schedules import play
 
 pytestmark = pytest.mark.system
-SCHEDULES, PIECE = sized(100_000), 500
+SCHEDULES, PIECE = sized(40_000), 500
 MUTANTS = sized(300)
 WITHIN = 20_000 if MUTANTS == 300 else 300  # schedules for each mutant
 

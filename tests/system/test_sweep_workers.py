@@ -117,7 +117,7 @@ def test_a_worker_dies_and_another_one_comes(piston, tmp_path):
 
 def test_ctrl_c_keeps_what_is_computed_and_nothing_is_computed_twice(tmp_path):
     # Long cells: after the first file of rows, which is written after some seconds, most are still to be computed.
-    words = ["--revolutions=200", "--vary", f"{LEAD}=1.4e-3:1.5e-3:{CELLS}", "--out", str(tmp_path / "rows")]
+    words = ["--revolutions=100", "--vary", f"{LEAD}=1.4e-3:1.5e-3:{CELLS}", "--out", str(tmp_path / "rows")]
     with lathe_sweep(*words, start_new_session=True) as stopped:
         for line in stopped.stderr:
             if "dashboard" in line:
