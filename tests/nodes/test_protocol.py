@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of a cell without ROS: simulated cells under hundreds of schedules, and single rules."""
+"""The protocol of a cell without ROS: simulated cells under thousands of schedules, and single rules."""
 
 import re
 from dataclasses import replace
