@@ -37,7 +37,7 @@ from matplotlib.figure import Figure
 from benchmarks import sides
 from lathe_rc import resources
 from lathe_rc.bag.reading import stream
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import scenario
@@ -209,7 +209,7 @@ def _record(what: Scenario, bag: Path) -> Callable[[], None]:
 
 def _info(bag: Path) -> Callable[[], None]:
     """What ``lathe bag info`` reads."""
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         types = {topic: said.type for topic, said in source.topics.items()}
     ends = part.FirstAndLast(types)
 

@@ -34,7 +34,7 @@ from benchmarks import sides
 from lathe_rc import messages, resources
 from lathe_rc.bag import reader
 from lathe_rc.bag.reading import stream
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
 from lathe_rc.bag.writing.writer import BagWriter, Compression, offered_qos
@@ -253,7 +253,7 @@ def _told(
 
 
 def _read_ours(bag: Path) -> None:
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         for _ in source.messages():
             pass
 

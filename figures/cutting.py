@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from lathe_machine.analysis.regeneration import Regeneration, lobes
 from lathe_machine.plants.cutting import CuttingProcess
 from lathe_machine.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, SpecificForce
-from lathe_machine.plants.workpiece import HardSpot, Part
+from lathe_machine.plants.workpiece import HardSpot, Workpiece
 from lathe_machine.signals.allowance import PAPER_RMS, Allowance, mean_reverting
 from lathe_machine.transfer import TransferFunction
 from place import PICTURES
@@ -109,7 +109,7 @@ random.set_title("allowance: walk of 20.7 µm RMS, run-out of 10 µm at 1.9 rev/
 
 step = 1 / 64000
 turns = SPEED * step * np.arange(round(40 * np.pi / SPEED / step)) / (2 * np.pi)
-part = Part(gaps=[(2.0, 0.6), (2.0 + np.pi, 0.6)], hard_spots=[HardSpot(0.2, 1.0, -1.0, 1.0, 1.4)])
+part = Workpiece(gaps=[(2.0, 0.6), (2.0 + np.pi, 0.6)], hard_spots=[HardSpot(0.2, 1.0, -1.0, 1.0, 1.4)])
 for lag, colour in ((0.0, GREY), (2e-3, BLUE), (0.075, RED)):
     process = CuttingProcess(depth=DEPTH, lag=lag, elasticity=RIGID, part=part, step=step)
     force = cut(process, SPEED, step, FEED, np.zeros(turns.size))["force"]

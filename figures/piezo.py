@@ -8,7 +8,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 import lathe_rc
-from lathe_commission.hysteresis_fit import Loop, identify
+from lathe_commission.hysteresis_fit import HysteresisLoop, identify
 from lathe_machine.stages.drive.piezo_actuator import PiezoActuator, PiezoActuatorParameters
 from lathe_machine.stages.drive.series_drive import SeriesDriveParameters, SeriesDriveStage
 from lathe_rc import messages
@@ -82,7 +82,7 @@ print("\n| loop at | noise | left by the fit | p0 | p1 … p10 | left when it li
 print("| ---: | ---: | ---: | ---: | --- | ---: |")
 for frequency, noise in ((1.0, 0.0), (1.0, 50e-9), (10.0, 0.0), (100.0, 0.0)):
     command = swing(frequency)
-    found = identify(Loop(command, position(command, linearisation="none", noise_rms=noise)), STROKE)
+    found = identify(HysteresisLoop(command, position(command, linearisation="none", noise_rms=noise)), STROKE)
     weights, proportional = found.model.weights, found.model.proportional
     rest = error(identified_weights=weights.tolist(), identified_proportional=proportional)
     print(

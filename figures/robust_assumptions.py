@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lathe_machine.stages.learning.learner import Loop
+from lathe_machine.stages.learning.learner import CheckedLoop
 from lathe_papers import cells, judge, robust
 from lathe_rc.arrays import Complex
 from lathe_rc.cell.wiring import Cell
@@ -64,5 +64,5 @@ def swings(at: judge.Array) -> Complex:
     return drive(at) + mode * np.exp(-p * robust.TOLD[2])
 
 
-loop = Loop(law, [swings], law.checked_speeds(*cell.master.speed_range()))
+loop = CheckedLoop(law, [swings], law.checked_speeds(*cell.master.speed_range()))
 print(f"\nwith a mode of 900 Hz: {law.factor} = {loop.factor({}):.3g}; cure: {' or '.join(loop.cures())}")

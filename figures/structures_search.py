@@ -3,10 +3,10 @@
 
 import numpy as np
 
-from lathe_papers.formulas.tuning import LEAD_LAG, LIMITS, PLAIN, START, Tuning, nearest, smallest_deviation
+from lathe_papers.formulas.tuning import LEAD_LAG, LIMITS, PLAIN, START, TuningParameters, nearest, smallest_deviation
 
 
-def row(name: str, spread: str, tuning: Tuning) -> str:
+def row(name: str, spread: str, tuning: TuningParameters) -> str:
     """A row of the table of searches."""
     largest = 100 * np.abs(tuning.deviations()).max(axis=1)
     fine, coarse = tuning.fine.natural_frequency, tuning.coarse.natural_frequency

@@ -19,7 +19,7 @@ import numpy as np
 
 from lathe_commission.cycle_weights import of_gaussian_process
 from lathe_commission.fir_inverse import fir_inverse
-from lathe_machine.stages.learning.learner import Learner, Loop, lag
+from lathe_machine.stages.learning.learner import CheckedLoop, Learner, lag
 from lathe_machine.stages.spindle.speed_law import SpeedLawParameters
 from lathe_rc import messages
 from lathe_rc.analysis.cycle_factors import DriveMargin, Response
@@ -57,7 +57,7 @@ _COMMON = {"feedback_delay", "reaction_delay", "retract_velocity", "retract_acce
 
 
 @dataclass(frozen=True)
-class Law:
+class FilteredLaw:
     """Law with a filter.
 
     Attributes:
@@ -155,41 +155,41 @@ _DISTURBANCE: list[Values] = [
 ]
 _INVERSE: Values = {"correction": "second_order_inverse"}
 #: laws by name
-LAWS: Mapping[str, Law] = {
-    "lead, exponential Q": Law("learning_controller", {"q_filter": "exponential"}, _SMOOTH),
-    "lead, Gaussian Q": Law("learning_controller", {"q_filter": "gaussian"}, _SMOOTH),
-    "lead, flat Q": Law("learning_controller", {"q_filter": "fir"}, _FLAT),
-    "notch, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "notch"),
-    "inverse, Gaussian Q": Law("learning_controller", {"q_filter": "gaussian", **_INVERSE}, _SMOOTH, "delay"),
-    "inverse, flat Q": Law("learning_controller", {"q_filter": "fir", **_INVERSE}, _FLAT, "delay"),
-    "zero phase, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "model"),
-    "measured, flat Q": Law("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "measured"),
-    "high order, flat Q": Law(
+LAWS: Mapping[str, FilteredLaw] = {
+    "lead, exponential Q": FilteredLaw("learning_controller", {"q_filter": "exponential"}, _SMOOTH),
+    "lead, Gaussian Q": FilteredLaw("learning_controller", {"q_filter": "gaussian"}, _SMOOTH),
+    "lead, flat Q": FilteredLaw("learning_controller", {"q_filter": "fir"}, _FLAT),
+    "notch, flat Q": FilteredLaw("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "notch"),
+    "inverse, Gaussian Q": FilteredLaw("learning_controller", {"q_filter": "gaussian", **_INVERSE}, _SMOOTH, "delay"),
+    "inverse, flat Q": FilteredLaw("learning_controller", {"q_filter": "fir", **_INVERSE}, _FLAT, "delay"),
+    "zero phase, flat Q": FilteredLaw("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "model"),
+    "measured, flat Q": FilteredLaw("learning_controller", {"q_filter": "fir", "correction": "fir"}, _FLAT, "measured"),
+    "high order, flat Q": FilteredLaw(
         "learning_controller",
         {"q_filter": "fir", "correction": "fir"},
         [{**each, "cycle_weights": weights} for each in _FLAT_OF_CYCLES for weights in _CYCLES],
         "model",
     ),
-    "Gaussian process": Law(
+    "Gaussian process": FilteredLaw(
         "learning_controller",
         {"q_filter": "fir", "correction": "fir"},
         [{**each, "cycle_weights": weights} for each in _FLAT_OF_CYCLES for weights in _PROCESSES],
         "model",
     ),
-    "norm-optimal": Law(
+    "norm-optimal": FilteredLaw(
         "norm_optimal_controller",
         {},
         [{"highest_order": orders, "change_weight": weight} for orders in _ORDERS for weight in _WEIGHTS],
         "",
     ),
-    "disturbance": Law("disturbance_controller", {"identify": False}, _DISTURBANCE, ""),
-    "disturbance, resonance": Law(
+    "disturbance": FilteredLaw("disturbance_controller", {"identify": False}, _DISTURBANCE, ""),
+    "disturbance, resonance": FilteredLaw(
         "disturbance_controller", {"identify": False, "inverse": "fourth_order"}, _DISTURBANCE, ""
     ),
 }  # fmt: skip
 
 
-class Found(NamedTuple):
+class WorstResult(NamedTuple):
     """Worst result of some runs.
 
     Attributes:
@@ -219,7 +219,7 @@ class Covered(NamedTuple):
     highest: float
 
 
-_FAILED = Found(np.inf, np.inf, np.nan)
+_FAILED = WorstResult(np.inf, np.inf, np.nan)
 
 
 @dataclass(frozen=True)
@@ -245,9 +245,9 @@ class Candidate:
     scenario: Scenario | None = None
     margin: DriveMargin | None = None
     where: str = ""
-    nominal: Found = _FAILED
-    worst: Found = _FAILED
-    other: Found = _FAILED
+    nominal: WorstResult = _FAILED
+    worst: WorstResult = _FAILED
+    other: WorstResult = _FAILED
     covered: Covered | None = None
     shortened: int | None = None
     reason: str = ""
@@ -397,13 +397,13 @@ class Design:
                 found.append(self._candidate(name, law))
         return sorted(found, key=_rank)
 
-    def _applies(self, law: Law) -> bool:
+    def _applies(self, law: FilteredLaw) -> bool:
         """Return whether the drive is known as a law needs it: with measured points, or with resonances."""
         if "inverse" in law.fixed:
             return any("inverse.denominator" in each for each in self._base.nodes[self._node].drive_models().values())
         return bool({"measured": self._measured, "notch": self._resonances}.get(law.lead, True))
 
-    def _with(self, base: Scenario, law: Law, values: Values) -> Scenario:
+    def _with(self, base: Scenario, law: FilteredLaw, values: Values) -> Scenario:
         """Return a scenario with a law in place of its learning controller."""
         before, table = base.nodes[self.node], TABLES[law.kind]
         common = table.model_fields.keys() & before.model_fields_set & (_COMMON | SharedParameters.model_fields.keys())
@@ -411,7 +411,7 @@ class Design:
         kept |= {name: limit for name, limit in self._limits.items() if name in table.model_fields}
         return base.with_node(self.node, table.read(self.node, {**kept, "stage": law.kind, **law.fixed, **values}))
 
-    def _candidate(self, name: str, law: Law) -> Candidate:
+    def _candidate(self, name: str, law: FilteredLaw) -> Candidate:
         settings, reason = self._settings(law)
         results = self._run([self._with(self._base, law, each.values) for each in settings])
         reasons = [] if settings else [reason]
@@ -427,7 +427,7 @@ class Design:
             # The law keeps the model of the nominal drive.
             scenarios = [self._with(speed, law, values) for speed in self._speeds]
             runs = [self._run([each.with_models_given().varied(drive) for drive in self.drives]) for each in scenarios]
-            worst = [Found(*map(max, zip(*found, strict=True))) for found in runs]
+            worst = [WorstResult(*map(max, zip(*found, strict=True))) for found in runs]
             failed = ((k, run.failure) for found in runs for k, run in enumerate(found, 1) if run.failure)
             if first := next(failed, None):
                 reasons.append(f"run with drive {first[0]}: {first[1]}")
@@ -439,7 +439,7 @@ class Design:
             return Candidate(name, whole, scenarios[0], margin, where, *of_runs, covered, shortened)
         return Candidate(name, reason=reasons[0])
 
-    def _settings(self, law: Law) -> tuple[list["_Setting"], str]:
+    def _settings(self, law: FilteredLaw) -> tuple[list["_Setting"], str]:
         """Return the settings to run, and why there is none.
 
         They are an even choice of those with the margin with the nominal drive and the measured points, with the best
@@ -466,7 +466,7 @@ class Design:
         chosen = sorted({round(k) for k in np.linspace(0, len(kept) - 1, _RUNS)}) if kept else []
         return [kept[k] for k in chosen], gap or reason
 
-    def _setting(self, law: Law, values: Values, wanted: float) -> "_Setting":
+    def _setting(self, law: FilteredLaw, values: Values, wanted: float) -> "_Setting":
         """Return a law with values, and with the longest feedback delay if that of the scenario is too long for it.
 
         A margin below ``wanted`` is an upper bound, see `_least`.
@@ -484,7 +484,7 @@ class Design:
         found = _Setting(values, loop, *self._least(loop, self._drives[: self._nominal], wanted))
         return found._replace(gap=self._gap(loop)) if found.error >= wanted else found
 
-    def _gap(self, loop: Loop) -> str:
+    def _gap(self, loop: CheckedLoop) -> str:
         """Return which gap between the measured points may hide what a law does not bear; empty if there is none."""
         _, nominal = self._drives[self._nominal - 1]
         for speed, (low, high, change) in product(loop.speeds, self._gaps):
@@ -499,7 +499,7 @@ class Design:
         return ""
 
     def _least(
-        self, loop: Loop, drives: Sequence[tuple[str, Response]], wanted: float
+        self, loop: CheckedLoop, drives: Sequence[tuple[str, Response]], wanted: float
     ) -> tuple[DriveMargin | None, str]:
         """Return the smallest drive margin, and the name of the drive; None if no check covers one of them.
 
@@ -516,19 +516,19 @@ class Design:
                     return least
         return least
 
-    def _covered(self, loop: Loop) -> Covered:
+    def _covered(self, loop: CheckedLoop) -> Covered:
         highest = max(loop.stage.highest_waves(speed) * speed for speed in loop.speeds)
         points = np.concatenate([np.zeros(0), *(each.frequency for each in self._points)])
         points = points[points <= highest]
         return Covered(points.size, (float(points.min(initial=np.inf)), float(points.max(initial=0.0))), highest)
 
-    def _loop(self, scenario: Scenario) -> tuple[Loop, Cell]:
+    def _loop(self, scenario: Scenario) -> tuple[CheckedLoop, Cell]:
         cell = self._runner.cell(scenario)
         stage = cell.stages[self.node]
         assert isinstance(stage, Learner), "as before, or a law has taken its place"
         return stage.checked_loop(cell), cell
 
-    def _run(self, scenarios: Sequence[Scenario]) -> list[Found]:
+    def _run(self, scenarios: Sequence[Scenario]) -> list[WorstResult]:
         found = []
         keep: batch.Make[tuple[FormErrors, float]] = partial(_Keep, self._node)
         for outcome in batch.run_many(scenarios, keep):
@@ -540,7 +540,7 @@ class Design:
             since = judge(errors.largest, self._tolerance).since if largest <= self._tolerance else 0
             grown = growth(errors.largest)
             failure = grown.told() if grown and grown.diverges else ""
-            found.append(Found(largest, float(since or np.inf), effort, failure))
+            found.append(WorstResult(largest, float(since or np.inf), effort, failure))
         return found
 
 
@@ -548,7 +548,7 @@ class _Setting(NamedTuple):
     """Values of a law with its loop and the smallest margin with some drives, see `Design._least`."""
 
     values: Values
-    loop: Loop
+    loop: CheckedLoop
     margin: DriveMargin | None
     where: str
     gap: str = ""

@@ -7,13 +7,13 @@ from lathe_commission.modal_fit import ResponseData, StepData
 from lathe_rc.analysis.frequency_response import FrequencyResponse, Hold, estimate, of_measurement
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
-from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.measurement_file import MeasuredQuantities
 
 _LEVEL = 1e-9  # of the height of a step, within which a command is constant
 
 
 def frequency_response(
-    measurement: Measurement,
+    measurement: MeasuredQuantities,
     *,
     rate: float | None = None,
     hold: Hold = "linear",
@@ -59,7 +59,7 @@ def _change(command: Array) -> int:
     return int(changes[0]) + 1 if changes.size == 1 else 0
 
 
-def step_response(measurement: Measurement, *, rate: float | None = None, hold: Hold = "linear") -> StepData:
+def step_response(measurement: MeasuredQuantities, *, rate: float | None = None, hold: Hold = "linear") -> StepData:
     """Return the response to a step of 1 at time 0.
 
     A record whose command changes once is divided by that change; the time begins in the middle of the sample before
@@ -82,7 +82,7 @@ def step_response(measurement: Measurement, *, rate: float | None = None, hold: 
 
 
 def data(
-    measurement: Measurement,
+    measurement: MeasuredQuantities,
     *,
     rate: float | None = None,
     hold: Hold = "linear",
@@ -114,7 +114,7 @@ def data(
         raise InputError(f"{measurement.name}: --band: {error}") from None
 
 
-def _refuse(measurement: Measurement, kind: str, **options: object) -> None:
+def _refuse(measurement: MeasuredQuantities, kind: str, **options: object) -> None:
     """Reject options that a kind of measurement would ignore."""
     for name, value in options.items():
         if value is not None:

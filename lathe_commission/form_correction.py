@@ -38,7 +38,7 @@ _LEAST = 5e-9  # [m] least amplitude that is corrected: profile files end at 10 
 
 
 @dataclass(frozen=True)
-class Revolution:
+class MeasuredRevolution:
     """Measured revolution of a part.
 
     Attributes:

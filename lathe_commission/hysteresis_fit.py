@@ -21,14 +21,14 @@ import scipy
 from lathe_machine.plants.hysteresis import THRESHOLDS, PrandtlIshlinskii, check_thresholds, plays
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, at_most
-from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.measurement_file import MeasuredQuantities
 
 _WHOLE = 0.95  # fraction of the range that counts as the full range
 _LEAST = 1e-9  # a slope below this cannot be inverted
 
 
 @dataclass(frozen=True)
-class Loop:
+class HysteresisLoop:
     """Measured hysteresis loop.
 
     Args:
@@ -54,7 +54,7 @@ class Loop:
 
 
 @dataclass(frozen=True)
-class Identified:
+class HysteresisFit:
     """Result of a hysteresis fit, relative to the half-stroke.
 
     Attributes:
@@ -68,7 +68,7 @@ class Identified:
     residual: float
 
 
-def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Identified:
+def identify(loop: HysteresisLoop, stroke: float, thresholds: Array = THRESHOLDS) -> HysteresisFit:
     """Fit the weights of a Prandtl-Ishlinskii model to a measured loop.
 
     Args:
@@ -118,21 +118,21 @@ def identify(loop: Loop, stroke: float, thresholds: Array = THRESHOLDS) -> Ident
         )
     left = displacement - columns @ fit.x
     residual = float(np.sqrt(np.mean(left**2)) / np.std(displacement))
-    return Identified(PrandtlIshlinskii(thresholds, weights, float(proportional)), float(offset) * stroke, residual)
+    return HysteresisFit(PrandtlIshlinskii(thresholds, weights, float(proportional)), float(offset) * stroke, residual)
 
 
-def of_measurement(measurement: Measurement) -> Loop:
+def of_measurement(measurement: MeasuredQuantities) -> HysteresisLoop:
     """Return the loop in a measurement: ``command`` and ``displacement``, in order of time.
 
     Raises:
         InputError: a quantity is missing, or contains a non-finite value.
     """
-    return Loop(*measurement.read("command", "displacement"))
+    return HysteresisLoop(*measurement.read("command", "displacement"))
 
 
 def from_signals(
     dense: Mapping[str, Mapping[str, Array]], command: str = "/fine/command", state: str = "/fine/state"
-) -> Loop:
+) -> HysteresisLoop:
     """Extract a hysteresis loop from the signals of a recorded run.
 
     Args:
@@ -146,4 +146,4 @@ def from_signals(
     for topic in (command, state):
         if topic not in dense:
             raise InputError(f"{topic} is not in the recording; there are {', '.join(sorted(dense)) or 'no topics'}")
-    return Loop(dense[command]["position"], dense[state]["measured_position"])
+    return HysteresisLoop(dense[command]["position"], dense[state]["measured_position"])

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lathe_commission.form_correction import Revolution
+from lathe_commission.form_correction import MeasuredRevolution
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, shown
 from lathe_rc.signals import measurement_file
@@ -17,7 +17,7 @@ _TURN = 2.0 * np.pi
 _WHOLE = 0.75  # least part of a revolution that a record has to cover
 
 
-def read_columns(path: Path, mapping: Mapping[str, Mapped]) -> list[Revolution]:
+def read_columns(path: Path, mapping: Mapping[str, Mapped]) -> list[MeasuredRevolution]:
     """Read the revolutions of a record from a file of columns (see `lathe_rc.signals.measurement_file`).
 
     Args:
@@ -37,7 +37,7 @@ def read_columns(path: Path, mapping: Mapping[str, Mapped]) -> list[Revolution]:
     return _split(path, {quantity: array[there] for quantity, array in values.items()})
 
 
-def _split(path: Path, values: Mapping[str, Array]) -> list[Revolution]:
+def _split(path: Path, values: Mapping[str, Array]) -> list[MeasuredRevolution]:
     """Split rows into revolutions: by their number, by height, or after each turn from the first row, either way."""
     angle = values["angle"]
     known = "height" in values
@@ -53,7 +53,7 @@ def _split(path: Path, values: Mapping[str, Array]) -> list[Revolution]:
     found = []
     for each in dict.fromkeys(number.tolist()):
         rows = number == each
-        revolution = Revolution(
+        revolution = MeasuredRevolution(
             np.mod(angle[rows], _TURN), values["radius"][rows], float(heights[rows].mean()) if known else None
         )
         if _covered(revolution.angle) >= _WHOLE:
@@ -76,7 +76,7 @@ def _covered(angle: Array) -> float:
     return float(steps[steps < np.radians(15.0)].sum() / _TURN)
 
 
-def read_x3p(path: Path) -> list[Revolution]:
+def read_x3p(path: Path) -> list[MeasuredRevolution]:
     """Read the revolutions of a record from an X3P file: layers of a profile, or rows of a surface.
 
     The points of a revolution are even, its first is at angle 0; points that are not measured are left out.
@@ -106,13 +106,13 @@ def read_x3p(path: Path) -> list[Revolution]:
         there = np.isfinite(row)
         angle = _TURN * np.arange(row.size) / row.size
         if _covered(angle[there]) >= _WHOLE:
-            found.append(Revolution(angle[there], row[there]))
+            found.append(MeasuredRevolution(angle[there], row[there]))
     if not found:
         raise InputError(f"{path}: no complete revolution; allowed: measured points over {_WHOLE:.0%} of it")
     return found
 
 
-def read(path: Path, mapping: Mapping[str, Mapped]) -> list[Revolution]:
+def read(path: Path, mapping: Mapping[str, Mapped]) -> list[MeasuredRevolution]:
     """Read a record by its ending: ``.x3p``, otherwise columns (see `read_columns`).
 
     Raises:

@@ -24,7 +24,7 @@ from lathe_machine.transfer import Hold, LinearSystem, TransferFunction
 from lathe_rc.analysis.frequency_response import FrequencyResponse
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError, at_least
-from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.measurement_file import MeasuredQuantities
 
 _SPREADS = (0.02, 0.1, 0.4)  # initial time constants of the searches, relative to the length of the record
 _DAMPINGS = (0.2, 1.2)
@@ -84,7 +84,7 @@ class ChannelStep:
         return float(self.time[-1] / (self.time.size - 1))
 
 
-def of_measurement(measurement: Measurement) -> ChannelStep:
+def of_measurement(measurement: MeasuredQuantities) -> ChannelStep:
     """Return the step response in a measurement: ``time`` since the step, and ``response`` to a step of 1.
 
     Raises:

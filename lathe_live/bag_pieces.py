@@ -5,7 +5,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.messages import MAX_BLOCK, START_NS, Signals
@@ -54,7 +54,7 @@ class _Pieces(list[Piece]):
         self.append(Piece(first, samples, dense, sparse))
 
 
-def pieces(source: Source, first: int, step_ns: int) -> Iterator[Piece]:
+def pieces(source: BagSource, first: int, step_ns: int) -> Iterator[Piece]:
     """Yield the samples of a bag's cell in order, up to the last one that all topics have, or to the loss of a member.
 
     Args:

@@ -15,7 +15,7 @@ from lathe_live.panel_outlook import plain_outlook
 from lathe_live.panel_view import View
 from lathe_rc import messages
 from lathe_rc.bag import provenance
-from lathe_rc.bag.reading.source import Source, name_of
+from lathe_rc.bag.reading.source import BagSource, name_of
 from lathe_rc.bag.reading.stream import first_of
 from lathe_rc.errors import InputError, LatheError
 
@@ -31,7 +31,7 @@ class _Checkpoint:
 
 
 class Player:
-    """Bag of a cell that is played (implements `lathe_live.panel_run.Run`).
+    """Bag of a cell that is played (implements `lathe_live.panel_run.PanelRun`).
 
     It reads the whole bag once, which fills the timeline and leaves checkpoints in a temporary file. From these, it
     goes to any sample by reading a piece of the bag.
@@ -57,7 +57,7 @@ class Player:
         self._open = ExitStack()
         self._file = self._open.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - it is closed with the bag
         try:
-            self._source = source = self._open.enter_context(Source(bag))
+            self._source = source = self._open.enter_context(BagSource(bag))
             types = {t: each.type for t, each in source.topics.items() if each.type in messages.signal_types()}
             dense = [topic for topic, kind in types.items() if kind in messages.block_types()]
             self._step_ns = next(filter(None, map(source.step_ns, dense)), 0)

@@ -39,7 +39,7 @@ _PATIENCE = 1.0  # [s] between looks whether the thread that is to answer still 
 _LATE = 0.25  # [s] behind its pace after which a run no longer makes up for the lost time
 
 
-class Run(Protocol):
+class PanelRun(Protocol):
     """Run that a thread advances.
 
     Attributes:
@@ -85,7 +85,7 @@ class Driver:
         pace: simulated seconds in a second; 0: as fast as possible.
     """
 
-    def __init__(self, run: Run, pace: float) -> None:
+    def __init__(self, run: PanelRun, pace: float) -> None:
         self.run, self._pace = run, pace
         self._commands: SimpleQueue[tuple[Callable[[], object], Future[Any]] | None] = SimpleQueue()
         self._running = False
@@ -234,7 +234,7 @@ class Driver:
 
 
 class LiveCell:
-    """Offline cell that is advanced block by block, with commands between blocks (implements `Run`).
+    """Offline cell that is advanced block by block, with commands between blocks (implements `PanelRun`).
 
     Args:
         scenario: the scenario.

@@ -23,7 +23,7 @@ from lathe_live.panel_timeline import Timeline
 from lathe_live.panel_topics import Topics
 from lathe_live.panel_verdict import Evaluation
 from lathe_live.rerun_part import Outlook, Scale
-from lathe_live.rerun_revolutions import ANGLES, Revolution, Revolutions
+from lathe_live.rerun_revolutions import ANGLES, DrawnRevolution, Revolutions
 from lathe_rc import event_log, messages
 from lathe_rc.analysis.tolerance import LAST, Verdict
 from lathe_rc.arrays import Array
@@ -35,7 +35,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.cell.stage import Stage
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.judge.loops import Loop, loops, watches
+from lathe_rc.judge.loops import ServoLoop, loops, watches
 from lathe_rc.judge.part import Tolerances, error_growth
 from lathe_rc.messages import Samples, Signals, full
 from lathe_rc.view.form_limits import Finding, form_limits, varying_speed
@@ -55,7 +55,7 @@ _RPM = 60.0 / (2.0 * np.pi)
 
 
 @dataclass(frozen=True)
-class Row:
+class MapRow:
     """Revolution in the map, or several that are merged.
 
     Attributes:
@@ -71,13 +71,13 @@ class Row:
     cells: Array
     out: bool = False
 
-    def merged(self, later: "Row") -> "Row":
+    def merged(self, later: "MapRow") -> "MapRow":
         """Return a row of these and later revolutions; of two, the one without the part does not count."""
         if self.out != later.out:
             cells = (later if self.out else self).cells
         else:
             cells = np.where(np.abs(later.cells) > np.abs(self.cells), later.cells, self.cells)
-        return Row(self.since, later.number, later.height, cells, self.out and later.out)
+        return MapRow(self.since, later.number, later.height, cells, self.out and later.out)
 
     def told(self) -> dict[str, Any]:
         """Return the row as JSON data."""
@@ -106,11 +106,11 @@ class Snapshot:
     run: int
     now: Mapping[str, Any]
     epoch: int
-    rows: list[Row]
-    open: Row | None
+    rows: list[MapRow]
+    open: MapRow | None
     log: list[dict[str, Any]]
     dropped: int
-    latest: Sequence[Row]
+    latest: Sequence[MapRow]
     radius: Array
     situation: Situation
 
@@ -125,11 +125,11 @@ def has_memory(stage: Stage) -> bool:
     return "clear" in stage.actions and any(port.type == messages.COMMAND for port in stage.outputs)
 
 
-def _row(revolution: Revolution, *, out: bool) -> Row:
+def _row(revolution: DrawnRevolution, *, out: bool) -> MapRow:
     parts = -revolution.error.reshape(CELLS, ANGLES // CELLS)
     largest = np.abs(parts).argmax(axis=1)
     cells = np.nan_to_num(parts[np.arange(CELLS), largest] * _UM)
-    return Row(revolution.number, revolution.number, revolution.height, cells, out)
+    return MapRow(revolution.number, revolution.number, revolution.height, cells, out)
 
 
 class View:
@@ -160,7 +160,7 @@ class View:
         self.live, self.lamp, self.age = live, Lamp(live=live), Age()
         self.timeline = Timeline(Topics.of({}))
         self.memories: Collection[str] = ()
-        self._loops: Sequence[Loop] = ()
+        self._loops: Sequence[ServoLoop] = ()
         self._declared: Mapping[str, Judged] = {}
         self._doubt = 0.0  # about the form, see `Tolerances`
         self._part: RunningForm | None = None  # from the first sample of the part on
@@ -212,10 +212,10 @@ class View:
         self._cut_to = 0  # last revolution with the tool in the part
         self._scale: Scale | None = None
         self._epoch, self._joined = 0, 0  # times that rows were merged; revolutions in the open row
-        self._rows: list[Row] = []
-        self._open: Row | None = None
-        self._newest: list[Row] = []
-        self._forms: list[Revolution] = []  # of the newest rows
+        self._rows: list[MapRow] = []
+        self._open: MapRow | None = None
+        self._newest: list[MapRow] = []
+        self._forms: list[DrawnRevolution] = []  # of the newest rows
         self._limits: tuple[int, list[Finding]] = (0, [])  # number of revolutions, and what limits the form error then
         self._part = None
         self._judged: tuple[object, Evaluation] = (None, Evaluation())  # evaluation, and what it rests on
@@ -327,7 +327,7 @@ class View:
         """Show the last revolution as well, at the end of a run."""
         self._add(self._revolutions.finish())
 
-    def _add(self, complete: Iterable[Revolution]) -> None:
+    def _add(self, complete: Iterable[DrawnRevolution]) -> None:
         for revolution in complete:
             row = _row(revolution, out=revolution.end > self._out[0] and self._end < self._out[1])
             self._end = revolution.end
@@ -527,7 +527,7 @@ def news(view: View, have: Have, patience: float) -> dict[str, Any]:
     """Return what a page lacks, as JSON data, once there is a new snapshot, or after some seconds; the lamp is current.
 
     Rows of the map come a few at a time. For each epoch that it has missed, a page first merges its rows in pairs as
-    `Row.merged` does, and drops the last one of an odd number.
+    `MapRow.merged` does, and drops the last one of an odd number.
 
     Raises:
         LatheError: there is no snapshot yet.

@@ -12,11 +12,11 @@ import numpy as np
 from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading import stream
-from lathe_rc.bag.reading.source import Source, name_of
+from lathe_rc.bag.reading.source import BagSource, name_of
 from lathe_rc.blocks.block import Block
 from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.judge.loops import Loop, loops
+from lathe_rc.judge.loops import ServoLoop, loops
 from lathe_rc.messages import START_NS
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _END_NS = 1_000_000_000  # length of the range at the end of a bag that is searc
 _POINTS = 300_000  # points of a curve; a long bag gets fewer per second
 
 
-def _block(source: Source, topic: str, *, last: bool = False) -> Block | None:
+def _block(source: BagSource, topic: str, *, last: bool = False) -> Block | None:
     """Return the first block of a topic, or the last if it is near the end of the bag."""
     try:
         if last:
@@ -44,7 +44,7 @@ def _scene(recording: "rr.RecordingStream", path: Path, rate: float) -> "Scene":
     from lathe_live.rerun_part import Outlook
     from lathe_live.rerun_scene import Scene
 
-    with Source(path) as source:
+    with BagSource(path) as source:
         types = {topic: kind.type for topic, kind in source.topics.items() if kind.type in messages.signal_types()}
         filled = {kind: t for t, kind in reversed(types.items()) if source.topics[t].count}  # first topic of each type
         first = {kind: _block(source, t) for kind, t in filled.items() if kind in messages.block_types()}
@@ -62,7 +62,7 @@ def _scene(recording: "rr.RecordingStream", path: Path, rate: float) -> "Scene":
             )
         silent = [topic for topic in types if not source.topics[topic].count]
         rate = min(rate, _POINTS / max((source.last_ns - START_NS) * 1e-9, 1e-9))
-        found: list[Loop] = []
+        found: list[ServoLoop] = []
         with contextlib.suppress(InputError):  # a bag that does not state them shows no results of loops
             found = loops(provenance.judged(source.about))
     outlook = Outlook(turned, travel)

@@ -9,7 +9,7 @@ from lathe_live import rerun_part as parts
 from lathe_live.rerun_signals import CYCLES, DRIVE, ERROR, PLOTS, POSITION, STATES, curve_path, curves
 from lathe_rc import messages
 from lathe_rc.event_log import LOGGED
-from lathe_rc.judge.loops import Loop
+from lathe_rc.judge.loops import ServoLoop
 
 _LATEST_S, _LATEST_REVOLUTIONS = 0.3, 5  # range before the time cursor, in plots of fast signals
 _FAST = {ERROR, POSITION, DRIVE}
@@ -32,7 +32,7 @@ _LATEST = _until_cursor(  # this range sets the scale of a plot
 )
 
 
-def _plots(types: Mapping[str, str], loops: Sequence[Loop]) -> dict[str, rrb.TimeSeriesView]:
+def _plots(types: Mapping[str, str], loops: Sequence[ServoLoop]) -> dict[str, rrb.TimeSeriesView]:
     """Return one plot per group of curves, for the curves that exist.
 
     Since a legend would cover the curves, the title names their colours instead if there are only a few.
@@ -86,7 +86,7 @@ def _part() -> rrb.Vertical:
     )
 
 
-def _loops(loops: Sequence[Loop]) -> list[rrb.View]:
+def _loops(loops: Sequence[ServoLoop]) -> list[rrb.View]:
     """Return a plot of the error of each force or position loop by revolution, and a text with their results."""
     found: list[rrb.View] = [
         rrb.TimeSeriesView(
@@ -104,7 +104,7 @@ def blueprint(
     *,
     live: bool = False,
     silent: Collection[str] = (),
-    loops: Sequence[Loop] = (),
+    loops: Sequence[ServoLoop] = (),
     bands: bool = False,
 ) -> rrb.Blueprint:
     """Return the layout for a run with the given topics.

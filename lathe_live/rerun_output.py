@@ -104,7 +104,7 @@ def viewer(kind: RerunOutput, port: int) -> Viewer:
     raise InputError("no display for a window; use -o FILE.rrd or --web")
 
 
-class Output:
+class LiveOutput:
     """Output of a live view, with one recording per run; a context manager.
 
     Args:
@@ -131,7 +131,7 @@ class Output:
             if file.exists():
                 raise InputError(f"{file} exists; a live view is never overwritten")
 
-    def __enter__(self) -> "Output":
+    def __enter__(self) -> "LiveOutput":
         """Start the viewer and wait until it answers.
 
         Raises:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lathe_live import diverging
 from lathe_live.panel_outlook import properties
-from lathe_live.rerun_revolutions import ANGLES, Revolution
+from lathe_live.rerun_revolutions import ANGLES, DrawnRevolution
 from lathe_rc.arrays import Array
 from lathe_rc.cell.scenario import Scenario
 
@@ -107,7 +107,7 @@ class Scale:
         return f"radius deviation ×{self.deviation / 1e3:.0f}, {along}"
 
 
-def ring(revolution: Revolution, scale: Scale) -> Ring:
+def ring(revolution: DrawnRevolution, scale: Scale) -> Ring:
     """Return vertices, normals and colours of the part's ring for a revolution; two rings form a strip."""
     angle = 2.0 * np.pi * (np.arange(_VERTICES) * _STEP + 0.5 * _STEP) / ANGLES
     radius = scale.x(revolution.radius.reshape(_VERTICES, _STEP).mean(axis=1))

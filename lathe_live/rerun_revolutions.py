@@ -18,7 +18,7 @@ _LONGEST = 2**22  # largest number of samples in one revolution
 
 
 @dataclass(frozen=True)
-class Revolution:
+class DrawnRevolution:
     """Form of the part in one complete revolution.
 
     Attributes:
@@ -67,7 +67,7 @@ def steps_of(turns: Array, first: int) -> Array:
     return np.asarray(step)
 
 
-def _measured(samples: Array, step: Array, end: int) -> Iterator[Revolution]:
+def _measured(samples: Array, step: Array, end: int) -> Iterator[DrawnRevolution]:
     """Yield the revolution of samples that each cover an angle step [revolution]; none if the spindle stood still."""
     turns, error, reference, height = samples
     if not step.any():
@@ -82,7 +82,7 @@ def _measured(samples: Array, step: Array, end: int) -> Iterator[Revolution]:
     )
     rms = float(np.sqrt(np.dot(error * error, step) / step.sum()))
     radius = mean_reference - mean_error
-    yield Revolution(number + 1, end, mean_error, radius, float(height.mean()), rms, float(np.abs(error).max()))
+    yield DrawnRevolution(number + 1, end, mean_error, radius, float(height.mean()), rms, float(np.abs(error).max()))
 
 
 class Revolutions:
@@ -99,7 +99,7 @@ class Revolutions:
         self._step = 0.0  # angle step to the last sample [revolution]
         self._entire: bool | None = None  # the revolution's first samples are present; None: not known yet
 
-    def add(self, first: int, angle: Array, error: Array, reference: Array, height: Array) -> Iterator[Revolution]:
+    def add(self, first: int, angle: Array, error: Array, reference: Array, height: Array) -> Iterator[DrawnRevolution]:
         """Add consecutive samples and return complete revolutions; a gap before them drops the current revolution.
 
         Args:
@@ -130,7 +130,7 @@ class Revolutions:
         self._entire = bool(begins) and turns.size - begins[-1] <= _LONGEST
         self._held = held[:, begins[-1] if self._entire else -1 :]  # at least one sample, for the step to the next one
 
-    def finish(self) -> Iterator[Revolution]:
+    def finish(self) -> Iterator[DrawnRevolution]:
         """Return the last revolution, if fewer than two of its samples are missing."""
         turns = self._held[0]
         if self._entire and self._step > 0.0 and turns[-1] + 2.0 * self._step >= np.floor(turns[-1]) + 1.0:

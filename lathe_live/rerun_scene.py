@@ -19,14 +19,14 @@ from PIL import Image
 
 from lathe_live import rerun_part as parts
 from lathe_live.rerun_blueprint import LOOP_RESULTS, LOOPS, blueprint
-from lathe_live.rerun_revolutions import HIGHEST, Revolution, Revolutions
+from lathe_live.rerun_revolutions import HIGHEST, DrawnRevolution, Revolutions
 from lathe_live.rerun_signals import CYCLES, STATE_COLOURS, STATES, curve_path, curves, extreme_samples, supervisor
 from lathe_rc import event_log, messages
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.beside import RERUN_RATE
 from lathe_rc.cell.soundness import FORM, Soundness, fields_of
 from lathe_rc.errors import LatheError, shown
-from lathe_rc.judge.loops import Loop, watches
+from lathe_rc.judge.loops import ServoLoop, watches
 from lathe_rc.messages import Samples, Signals, full
 
 _POSES = 250.0  # poses of part and tool per second
@@ -73,7 +73,7 @@ class Scene:
         rate: float = RERUN_RATE,
         live: bool = False,
         silent: Collection[str] = (),
-        loops: Sequence[Loop] = (),
+        loops: Sequence[ServoLoop] = (),
     ) -> None:
         self._loops = watches(loops, {full(topic): kind for topic, kind in types.items()})
         self._recording, self._step_ns = recording, step_ns
@@ -93,7 +93,7 @@ class Scene:
         self._rows: list[npt.NDArray[np.uint8]] = []
         self._every = 1  # one row and one ring per this many revolutions
         self._sent = 0  # number of rows in the map sent last
-        self._newest: Revolution | None = None
+        self._newest: DrawnRevolution | None = None
         self.points = self.revolutions = 0
         self.learn(types)
 
@@ -254,7 +254,7 @@ class Scene:
 
     # --- revolutions
 
-    def _log_revolutions(self, complete: list[Revolution]) -> None:
+    def _log_revolutions(self, complete: list[DrawnRevolution]) -> None:
         """Log rings, map rows, spectra and the learning curve of complete revolutions."""
         if not complete:
             return
@@ -263,7 +263,7 @@ class Scene:
         for name in ("rms", "largest"):
             values = parts.log_um(np.array([getattr(revolution, name) for revolution in complete]))
             self._send(f"learning/form_error/{name}", rr.Scalars.columns(scalars=values), *_times_of(complete))
-        rings: list[Revolution] = []
+        rings: list[DrawnRevolution] = []
         strips: list[parts.Ring] = []
         for revolution in complete:
             bars = rr.BarChart.columns(values=revolution.harmonics()[1:] * 1e6, abscissa=_BARS)
@@ -280,7 +280,7 @@ class Scene:
             columns = rr.Mesh3D.columns(vertex_positions=vertices, vertex_normals=normals, vertex_colors=colours)
             self._send("machine/part/surface", columns.partition([parts.STRIP] * len(rings)), *_times_of(rings))
 
-    def _add_row(self, revolution: Revolution) -> None:
+    def _add_row(self, revolution: DrawnRevolution) -> None:
         """Add a row to the map; when the map is full, every second row is dropped."""
         self._rows.append(parts.colours(-revolution.error)[:, :3])
         # Each map is sent in full, so only after a relative growth: the total size is a multiple of the last map's.
@@ -292,7 +292,7 @@ class Scene:
             self._every *= 2
             self._sent = len(self._rows)
 
-    def _send_map(self, revolution: Revolution) -> None:
+    def _send_map(self, revolution: DrawnRevolution) -> None:
         self._sent = len(self._rows)
         image = np.stack(self._rows)
         tall, wide = max(1, _TALL // len(image)), -(-len(image) // _TALL)  # Rerun shows pixels as squares
@@ -338,7 +338,7 @@ class Scene:
             self._recording.send_columns(path, when, columns, strict=True)
 
 
-def _times_of(revolutions: list[Revolution]) -> tuple[Samples, Samples]:
+def _times_of(revolutions: list[DrawnRevolution]) -> tuple[Samples, Samples]:
     """Return the samples that follow the revolutions, and the numbers of the revolutions."""
     return np.array([each.end for each in revolutions]), np.array([each.number for each in revolutions])
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lathe_rc import messages
 from lathe_rc.analysis.tolerance import FORCE as NEWTONS
 from lathe_rc.event_log import LOGGED
-from lathe_rc.judge.loops import Loop, watches
+from lathe_rc.judge.loops import ServoLoop, watches
 from lathe_rc.messages import Samples, full
 
 
@@ -71,7 +71,7 @@ _PART = {
 }  # for the view of the part
 
 
-def curves(types: Mapping[str, str], loops: Sequence[Loop] = ()) -> dict[str, dict[str, Curve]]:
+def curves(types: Mapping[str, str], loops: Sequence[ServoLoop] = ()) -> dict[str, dict[str, Curve]]:
     """Return the plotted curves of a recording, by fully qualified topic and field.
 
     Args:

@@ -18,7 +18,7 @@ from lathe_machine.plants.cutting import CuttingProcess
 from lathe_machine.plants.cutting_force import RIGID, SpecificForce
 from lathe_machine.plants.spindle import LoadedSpindle, SpeedLoop
 from lathe_machine.plants.tool_drive import ToolDrive
-from lathe_machine.plants.workpiece import Part
+from lathe_machine.plants.workpiece import Workpiece
 from lathe_papers.formulas.loaded import compliance
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
@@ -158,7 +158,7 @@ def _cut(given: CouplingParameters) -> CuttingProcess:
         depth=given.depth,
         lag=given.lag,
         elasticity=RIGID,
-        part=Part(gaps=_GAPS),
+        part=Workpiece(gaps=_GAPS),
         step=_STEP,
     )
 

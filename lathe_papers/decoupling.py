@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Group
 
 from lathe_commission.reduced_order import ChannelStep, Fit, fit, fit_inverse, step_of
-from lathe_machine.analysis.pid_tuning import Loop, closed_loop, evaluate
+from lathe_machine.analysis.pid_tuning import TunedLoop, closed_loop, evaluate
 from lathe_machine.control.decoupler import FULL_W1, gain
 from lathe_machine.control.pid import FORCE, POSITION, PidGains
 from lathe_papers.decoupling_runs import (
@@ -78,7 +78,7 @@ _NOISE_LABELS = {
 _RED, _BLUE, _AMBER, _GREY = "#c0392b", "#1f6f8b", "#e08e0b", "#7f8c8d"
 
 
-def numbers(loop: Loop) -> dict[str, float | None]:
+def numbers(loop: TunedLoop) -> dict[str, float | None]:
     """Return the key figures of a loop in the paper's units; None for missing values."""
     values = {
         "rise_s": loop.rise,
@@ -111,7 +111,7 @@ class DecouplingResult:
     prompt: Behaviour
     delayed: Behaviour
     robustness: Mapping[str, float]
-    full: Loop
+    full: TunedLoop
     uncompensated: Course
     alone: Course
     entries: tuple[Course, Course]

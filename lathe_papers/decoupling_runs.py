@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le
 
-from lathe_machine.analysis.pid_tuning import Loop, evaluate
+from lathe_machine.analysis.pid_tuning import TunedLoop, evaluate
 from lathe_machine.control.decoupler import PRESETS
 from lathe_machine.control.pid import FORCE, POSITION
 from lathe_machine.signals.allowance import Allowance, mean_reverting
@@ -156,8 +156,8 @@ class Behaviour:
     """
 
     stability: Mapping[str, float]
-    force: Loop
-    position: Loop
+    force: TunedLoop
+    position: TunedLoop
     position_step: tuple[Course, Course]
     force_step: tuple[Course, Course]
     noise: Course

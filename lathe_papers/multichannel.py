@@ -14,7 +14,7 @@ from rich.console import Group
 
 from lathe_papers import cells, marks
 from lathe_papers.formulas.structures import contraction, direct_compensation, iterative, supremum
-from lathe_papers.formulas.tuning import FREQUENCIES, HIGHEST, LEAD_LAG, PLAIN, PRINTED, ROWS, Tuning
+from lathe_papers.formulas.tuning import FREQUENCIES, HIGHEST, LEAD_LAG, PLAIN, PRINTED, ROWS, TuningParameters
 from lathe_rc import messages
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.cell.parameters import parameter
@@ -118,14 +118,14 @@ class MultichannelResult:
         axes.legend(fontsize=7)
 
 
-def analytic(tuning: Tuning, frequency: Array) -> Complex:
+def analytic(tuning: TuningParameters, frequency: Array) -> Complex:
     """Return the ratio of steady error to profile for the four structures at ``frequency`` [rad/s], shape (4, n)."""
     coarse, fine = tuning.coarse.steady_error(frequency), tuning.fine.steady_error(frequency)
     direct = direct_compensation(coarse, tuning.fine.drive(frequency))
     return np.stack((coarse, direct, iterative(coarse, coarse), iterative(coarse, fine)))
 
 
-def _nodes(structure: str, tuning: Tuning, correction: str) -> dict[str, dict[str, object]]:
+def _nodes(structure: str, tuning: TuningParameters, correction: str) -> dict[str, dict[str, object]]:
     """Return the parameters of drives and controllers of a structure."""
     fine = tuning.coarse if structure == "two_coarse" else tuning.fine
 

@@ -19,7 +19,7 @@ from rich.console import Group
 from rich.table import Table as RichTable
 
 from lathe_machine.stages.drive.drive import Drive
-from lathe_machine.stages.learning.learner import LawParameters, Learner, Loop
+from lathe_machine.stages.learning.learner import CheckedLoop, LawParameters, Learner
 from lathe_papers import cells, marks, robust
 from lathe_papers.judge import Judge, Judged, figure_of, finite, worst_of
 from lathe_rc.analysis.tolerance import LAST
@@ -282,7 +282,7 @@ def margins(law: Scenario, drives: list[Values]) -> Array:
         drive = Cell(law.varied(values).nodes).stages["loaded_drive"]
         assert isinstance(drive, Drive), "it is one"
         responses = [drive.responses()["coarse/command"], *drive.states().get("coarse/command", ())]
-        loop = Loop(stage, responses, (0.9 * nominal, nominal, 1.1 * nominal))
+        loop = CheckedLoop(stage, responses, (0.9 * nominal, nominal, 1.1 * nominal))
         margin = loop.drive_margin()
         found.append(np.nan if margin is None else margin.error)
     return np.array(found)

@@ -22,9 +22,9 @@ from lathe_papers.sampled_servo_numbers import (
     RATIOS,
     TERMS,
     LinkRow,
-    Row,
     SampledServoNumbers,
     SampledServoParameters,
+    ServoRow,
 )
 from lathe_rc.arrays import Array
 from lathe_rc.study import Study, Track, untracked
@@ -55,14 +55,14 @@ def _as_continuous(function: PseudoFrequency, time: Array) -> Measures | None:
     return None if response is None else sampled_loop.measures(time, response)
 
 
-def _table_row(drive: SampledDrive, ratio: float, time: Array, printed: tuple[float, float] | None) -> Row:
+def _table_row(drive: SampledDrive, ratio: float, time: Array, printed: tuple[float, float] | None) -> ServoRow:
     link = towards(drive, ratio)
     periods = sampled_loop.periods_to_settle(drive, link)
     true = None
     if periods is not None:
         step = sampled_loop.step_response(drive, link, periods=periods)
         true = sampled_loop.measures(step.time, step.load)
-    return Row(drive.period / 2.0, ratio, _as_continuous(sampled_loop.desired(drive, ratio), time), true, printed)
+    return ServoRow(drive.period / 2.0, ratio, _as_continuous(sampled_loop.desired(drive, ratio), time), true, printed)
 
 
 def _late(drive: SampledDrive, link: Link, delay: float) -> Measures | None:

@@ -65,7 +65,7 @@ class SampledServoParameters(StudyParameters):
 
 
 @dataclass(frozen=True)
-class Row:
+class ServoRow:
     """Row of the table of paper 003.
 
     Attributes:
@@ -148,7 +148,7 @@ class SampledServoNumbers:
 
     parameters: SampledServoParameters
     analog: Array
-    rows: tuple[Row, ...]
+    rows: tuple[ServoRow, ...]
     uncorrected: tuple[LinkRow, ...]
     misread: tuple[Measures | None, ...]
     links: dict[str, tuple[LinkRow, ...]]

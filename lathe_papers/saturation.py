@@ -16,7 +16,14 @@ from rich.table import Table
 from lathe_machine.control.periodic import PRESETS, PeriodicGains
 from lathe_papers.formulas import hyperstability
 from lathe_papers.formulas.hyperstability import BOX, NAMES, NOMINAL, Learning, Positivity
-from lathe_papers.formulas.periodic_example import Case, Outcome, ideal_input, limited_ideal_error, simulate, times
+from lathe_papers.formulas.periodic_example import (
+    Case,
+    ExampleOutcome,
+    ideal_input,
+    limited_ideal_error,
+    simulate,
+    times,
+)
 from lathe_rc.arrays import Array
 from lathe_rc.cell.parameters import parameter
 from lathe_rc.study import Study, StudyParameters, Track, comparison, untracked
@@ -98,10 +105,10 @@ class SaturationResult:
     """
 
     parameters: SaturationParameters
-    outcome: Outcome
-    without_filter: Outcome
-    with_filter: Outcome
-    corners: list[Outcome]
+    outcome: ExampleOutcome
+    without_filter: ExampleOutcome
+    with_filter: ExampleOutcome
+    corners: list[ExampleOutcome]
     checks: list[Check]
     conditions: Conditions
 
@@ -256,7 +263,7 @@ class SaturationResult:
         axes.set_title("factor of the memory in a period, nominal drive", fontsize=10)
 
 
-def _errors(outcome: Outcome) -> dict[str, Any]:
+def _errors(outcome: ExampleOutcome) -> dict[str, Any]:
     controller = outcome.controller
     return {
         "period_max_error": outcome.period_max_error.tolist(),
@@ -265,7 +272,7 @@ def _errors(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _counted(outcome: Outcome) -> Array:
+def _counted(outcome: ExampleOutcome) -> Array:
     return np.arange(1.0, outcome.period_max_error.size + 1.0)
 
 
@@ -279,13 +286,15 @@ def _where(found: Positivity) -> str:
     return f"{frequency}, corner {''.join(ends)}"
 
 
-def _checks(step: float, needed: tuple[float, float], without_filter: Outcome, with_filter: Outcome) -> list[Check]:
+def _checks(
+    step: float, needed: tuple[float, float], without_filter: ExampleOutcome, with_filter: ExampleOutcome
+) -> list[Check]:
     """Compute the comparisons with the numbers of the specification."""
 
-    def at(outcome: Outcome, period: int) -> float:
+    def at(outcome: ExampleOutcome, period: int) -> float:
         return float(outcome.period_max_error[period - 1])
 
-    def short(*, anti_windup: bool) -> Outcome:
+    def short(*, anti_windup: bool) -> ExampleOutcome:
         return simulate(Case(periods=40, step=step, s0=_SHORT * needed[0], anti_windup=anti_windup), NOMINAL)
 
     def quantised(preset: str) -> float:

@@ -12,7 +12,7 @@ from lathe_rc.blocks.ports import Input, signal_depth
 from lathe_rc.cell.beside import BESIDE
 from lathe_rc.cell.host_topics import HOST_TOPICS, MEMBERS
 from lathe_rc.cell.kinds import STAGES
-from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters
+from lathe_rc.cell.parameters import NodeParameters, ParameterRow, SharedParameters
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import Stage
 
@@ -50,7 +50,7 @@ depth of {signal_depth(SharedParameters().window)} at the default `window`; a to
 requested as volatile. Every node is a lifecycle node with the standard parameter and lifecycle services."""
 
 
-def _allowed(row: Row) -> str:
+def _allowed(row: ParameterRow) -> str:
     choices = ("true", "false") if row.type is bool else row.choices
     names = ", ".join(f"`{choice}`" for choice in choices if choice)
     if row.named:
@@ -58,7 +58,7 @@ def _allowed(row: Row) -> str:
     return names or row.limits or "any"
 
 
-def _parameters(rows: Mapping[str, Row]) -> str:
+def _parameters(rows: Mapping[str, ParameterRow]) -> str:
     return _table(
         ["parameter", "type", "default", "allowed", "unit", "description"],
         [
@@ -75,7 +75,7 @@ def _parameters(rows: Mapping[str, Row]) -> str:
     )
 
 
-def _only(table: type[NodeParameters], base: type[SharedParameters]) -> dict[str, Row]:
+def _only(table: type[NodeParameters], base: type[SharedParameters]) -> dict[str, ParameterRow]:
     """Return the parameters that a table adds to those of a base class."""
     return {name: row for name, row in table.rows().items() if name not in base.model_fields}
 

@@ -45,7 +45,7 @@ def untracked(items: Sequence[T], /) -> Iterable[T]:
     return items
 
 
-class Result(Protocol):
+class StudyResult(Protocol):
     """Result of a study; a frozen dataclass."""
 
     def to_json(self) -> dict[str, Any]:
@@ -58,10 +58,10 @@ class Result(Protocol):
         """Draw the result into an empty figure."""
 
 
-class Run(Protocol[P_contra]):
+class Computation(Protocol[P_contra]):
     """Function that computes a study; it is pure: equal parameters give equal results."""
 
-    def __call__(self, parameters: P_contra, track: Track = ...) -> Result:
+    def __call__(self, parameters: P_contra, track: Track = ...) -> StudyResult:
         """Compute the study; its longest loop iterates over ``track(items)``."""
 
 
@@ -80,7 +80,7 @@ class Study(Generic[P]):
     name: str
     doc: str
     parameters: type[P]
-    run: Run[P]
+    run: Computation[P]
     size: tuple[float, float] = (11.0, 3.8)
 
 

@@ -11,12 +11,12 @@ from rich.table import Table
 
 from lathe_bagtools.resimulation import identify
 from lathe_bagtools.resimulation.bag_spindle import asked_for
-from lathe_bagtools.resimulation.identify import Identified
+from lathe_bagtools.resimulation.identify import IdentifiedDrive
 from lathe_bagtools.resimulation.resim import Resimulation, resimulate
 from lathe_machine.analysis import drive_fit
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.recorded import Recorded
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.commands import lossy, options, tables
 from lathe_rc.errors import InputError
 from lathe_rc.names import pairs
@@ -39,7 +39,7 @@ def _table(found: Resimulation) -> Table:
     return tables.of_rows(tables.spread(rms.size), columns, title="form error, RMS [µm]")
 
 
-def _drive_told(drive: Identified) -> Iterator[RenderableType]:
+def _drive_told(drive: IdentifiedDrive) -> Iterator[RenderableType]:
     """Yield the identified parameters beside those of the scenario, and the quality of the fit."""
     fit, before = drive.fit, drive.before
     columns: dict[str, Callable[[str], str]] = {
@@ -58,7 +58,7 @@ def _drive_told(drive: Identified) -> Iterator[RenderableType]:
         yield f"warning: the command hardly tells {' and '.join(fit.vague)} apart; record one that moves more"
 
 
-def _drive_summary(drive: Identified) -> dict[str, Any]:
+def _drive_summary(drive: IdentifiedDrive) -> dict[str, Any]:
     """Return the JSON summary of a drive, in SI units."""
     fit = drive.fit
     return {
@@ -87,9 +87,11 @@ def _topics(given: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _identified_alone(bag: Path, topics: Mapping[str, str], parameters: Path | None) -> tuple[list[Identified], str]:
+def _identified_alone(
+    bag: Path, topics: Mapping[str, str], parameters: Path | None
+) -> tuple[list[IdentifiedDrive], str]:
     """Identify the drives of a bag without a scenario; return them with the reason why the bag is not re-simulated."""
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         recorded = Recorded(source, topics)
         recorded.check_names(["encoder", "tool", "coarse/command", "coarse/state"])
         found = identify.drives(recorded, None)
@@ -99,7 +101,7 @@ def _identified_alone(bag: Path, topics: Mapping[str, str], parameters: Path | N
 
 
 def _has_scenario(bag: Path) -> bool:
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         return provenance.SCENARIO in source.about
 
 
@@ -191,7 +193,7 @@ def _summary(found: Resimulation, bag: Path, output: Path | None) -> dict[str, A
     }
 
 
-def _drives_told(drives: Sequence[Identified], parameters: Path | None) -> Iterator[RenderableType]:
+def _drives_told(drives: Sequence[IdentifiedDrive], parameters: Path | None) -> Iterator[RenderableType]:
     for drive in drives:
         yield from _drive_told(drive)
     if parameters:
@@ -218,7 +220,7 @@ def _told(found: Resimulation, output: Path | None) -> Iterator[RenderableType]:
 
 def _write_form(bag: Path, topics: Mapping[str, str], path: Path, *, quiet: bool) -> None:
     """Write the recorded tool position as a function of the angle."""
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         found = identify.form(Recorded(source, topics))
     identify.write_form(path, found)
     first, last = found.revolutions

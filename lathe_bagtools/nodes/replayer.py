@@ -30,7 +30,7 @@ from lathe_bagtools.nodes.replay_services import ReplayServices
 from lathe_bagtools.nodes.replayed_qos import DEPTH
 from lathe_rc.bag import provenance
 from lathe_rc.bag.reading.limits import MOST_BEFORE, MOST_SENT
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.storage import Message
 from lathe_rc.cell.beside import REPLAYED_FILES, ReplayerParameters
 from lathe_rc.cell.beside import REPLAYER as KIND
@@ -132,7 +132,7 @@ class Replayer:
         self,
         node: StandaloneNode,
         parameters: ReplayerParameters,
-        source: Source,
+        source: BagSource,
         pressed: Callable[[], list[str]] = list,
     ) -> None:
         self._node, self._parameters, self._source = node, parameters, source
@@ -539,7 +539,7 @@ def _span(seconds: float) -> str:
 def _work(node: StandaloneNode, parameters: ReplayerParameters) -> None:
     if not parameters.bag:
         raise InputError(f"{KIND}.bag is empty; name the bag's folder")
-    with Source(Path(parameters.bag)) as source, keys.listening() as pressed:
+    with BagSource(Path(parameters.bag)) as source, keys.listening() as pressed:
         replayer = Replayer(node, parameters, source, pressed)
         replayer.run()
         node.get_logger().info(f"{replayer.sent} messages sent")

@@ -13,7 +13,7 @@ from lathe_machine.stages.tool.tool import Tool
 from lathe_rc import messages
 from lathe_rc.arrays import put
 from lathe_rc.bag.reading.recorded import Recorded, Spindle
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.stream import SampleReader, first_of
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.events import Trigger
@@ -252,7 +252,7 @@ def asked_for(recorded: Recorded, *, identified: bool = False) -> str:
     return f"the bag holds no scenario; it has {recorded.holdings()}; missing: {'; '.join(missing)}"
 
 
-def _samples(source: Source, topic: str) -> int:
+def _samples(source: BagSource, topic: str) -> int:
     """Return the number of samples of a dense topic, from its last block."""
     if topic not in source.topics or source.topics[topic].type != messages.ENCODER:
         raise InputError(f"{source.path}: no encoder on {topic}; a re-simulation needs the recorded spindle")
@@ -265,7 +265,7 @@ def _samples(source: Source, topic: str) -> int:
     return last.first_index + last.samples
 
 
-def _events(source: Source, first: int) -> dict[str, list[tuple[int, str]]]:
+def _events(source: BagSource, first: int) -> dict[str, list[tuple[int, str]]]:
     """Return the events of each node from sample ``first`` on: the sample at which each took effect, and its action."""
     topics = {topic for topic, said in source.topics.items() if said.type == messages.EVENT}
     found: dict[str, list[tuple[int, str]]] = {}

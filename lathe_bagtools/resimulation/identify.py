@@ -27,7 +27,7 @@ _FORM_POINTS = 720
 
 
 @dataclass(frozen=True)
-class Identified:
+class IdentifiedDrive:
     """Identified model of a drive.
 
     Attributes:
@@ -45,7 +45,7 @@ class Identified:
     before: Mapping[str, float] | None
 
 
-def drives(recorded: Recorded, scenario: Scenario | None) -> list[Identified]:
+def drives(recorded: Recorded, scenario: Scenario | None) -> list[IdentifiedDrive]:
     """Identify the electrodynamic drives of a scenario or, without a scenario, the drive on the default topics.
 
     Raises:
@@ -65,7 +65,7 @@ def drives(recorded: Recorded, scenario: Scenario | None) -> list[Identified]:
     return [_drive(recorded, name, table, known=scenario is not None) for name, table in tables.items()]
 
 
-def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool) -> Identified:
+def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool) -> IdentifiedDrive:
     assert isinstance(table, ElectrodynamicActuatorParameters), "of_kind() says so"
     beyond = {"gain": table.gain} if table.gain != 1.0 else {}
     beyond |= {name: values for name in _BEYOND if (values := getattr(table, name))}
@@ -107,10 +107,10 @@ def _drive(recorded: Recorded, node: str, table: NodeParameters, *, known: bool)
     except InputError as error:
         raise InputError(f"{recorded.path}: {node} from {command} and {topic}: {error}") from None
     before = {name: float(getattr(table, name)) for name in drive_fit.PARAMETERS} if known else None
-    return Identified(node, command, (topic, field), fit, before)
+    return IdentifiedDrive(node, command, (topic, field), fit, before)
 
 
-def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario:
+def with_identified(scenario: Scenario, found: Sequence[IdentifiedDrive]) -> Scenario:
     """Return the scenario with the identified parameters in place of its own.
 
     Raises:
@@ -125,7 +125,7 @@ def with_identified(scenario: Scenario, found: Sequence[Identified]) -> Scenario
     return Scenario(scenario.name, models.resolved(nodes))
 
 
-def write_parameters(path: Path, scenario: Scenario | None, found: Sequence[Identified]) -> None:
+def write_parameters(path: Path, scenario: Scenario | None, found: Sequence[IdentifiedDrive]) -> None:
     """Write a parameter file with the whole scenario or, without a scenario, the identified parameters.
 
     Files that the scenario refers to are copied into the same folder, because files unpacked from a bag are temporary.
@@ -160,7 +160,7 @@ def _with_files(path: Path, node: str, table: NodeParameters) -> NodeParameters:
 
 
 @dataclass(frozen=True)
-class Form:
+class MeanForm:
     """Tool position over the spindle angle, averaged over several revolutions.
 
     Attributes:
@@ -174,7 +174,7 @@ class Form:
     scatter: float
 
 
-def form(recorded: Recorded) -> Form:
+def form(recorded: Recorded) -> MeanForm:
     """Return the recorded tool position over the angle, averaged over the second half of the revolutions.
 
     Raises:
@@ -199,10 +199,10 @@ def form(recorded: Recorded) -> Form:
         raise InputError(f"{recorded.path}: no form: not one complete revolution was recorded")
     first = every.shape[0] // 2
     average = every[first:].mean(axis=0)
-    return Form(average, (first + 1, every.shape[0]), float(np.sqrt(np.mean((every[first:] - average) ** 2))))
+    return MeanForm(average, (first + 1, every.shape[0]), float(np.sqrt(np.mean((every[first:] - average) ** 2))))
 
 
-def write_form(path: Path, found: Form) -> None:
+def write_form(path: Path, found: MeanForm) -> None:
     """Write a form as a CSV file for the ``profile_file`` parameter of a tool.
 
     Raises:

@@ -19,11 +19,11 @@ import numpy as np
 
 from lathe_bagtools.resimulation import identify
 from lathe_bagtools.resimulation.bag_spindle import asked_for, wire
-from lathe_bagtools.resimulation.identify import Identified
+from lathe_bagtools.resimulation.identify import IdentifiedDrive
 from lathe_rc import messages
 from lathe_rc.bag import check, provenance
 from lathe_rc.bag.reading.recorded import Recorded
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.stream import From, feed, first_of
 from lathe_rc.bag.snapshot import GONE_ON, span_of
 from lathe_rc.bag.writing.record import OfflineRecorder, begin
@@ -77,7 +77,7 @@ class Resimulation:
     recorded_rms: Samples = field(repr=False)
     between_rms: Samples = field(repr=False)
     positions: list[tuple[str, str]]
-    drives: list[Identified]
+    drives: list[IdentifiedDrive]
     warnings: list[str]
 
     @property
@@ -145,7 +145,7 @@ def with_controller(scenario: Scenario, file: Path) -> Scenario:
     return Scenario(scenario.name, models.resolved(nodes))
 
 
-def _refuse_part(source: Source, *, begun: bool) -> None:
+def _refuse_part(source: BagSource, *, begun: bool) -> None:
     if loss := source.loss:
         raise InputError(
             f"{source.path}: nodes were lost on the way, {loss.why}; allowed: a bag of a run that nothing interrupted"
@@ -192,7 +192,7 @@ def resimulate(
     """
     if output is not None:
         refuse_existing(output)
-    with Source(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
+    with BagSource(path) as source, tempfile.TemporaryDirectory(prefix="lathe-resim-") as folder:
         _refuse_part(source, begun=start_from is not None)
         recorded = Recorded(source, topics or {})
         overrides = [*overrides, *_start(source, start_from, given=scenario is not None)]
@@ -298,7 +298,7 @@ def _names(override: str, parameters: Collection[str]) -> bool:
     return name in parameters or name.rpartition(".")[2] in parameters
 
 
-def _start(source: Source, path: Path | None, *, given: bool) -> list[str]:
+def _start(source: BagSource, path: Path | None, *, given: bool) -> list[str]:
     """Return the override that lets the cell of a bag go on from a checkpoint, if there is one.
 
     Raises:
@@ -346,7 +346,7 @@ def _refuse_events(chosen: Scenario, original: Scenario | None) -> None:
 def _digests_from(path: Path, cell: Cell) -> dict[str, str]:
     """Return the digests of a bag from the first sample of a cell on; empty if the recording is incomplete."""
     found = check.recorded(path) or check.check(path).digests
-    with Source(path) as source:
+    with BagSource(path) as source:
         if not found or cell.first <= first_of(source):
             return found
         sparse = [topic for topic, said in source.topics.items() if said.type in messages.sparse_types()]
@@ -357,7 +357,7 @@ def _digests_from(path: Path, cell: Cell) -> dict[str, str]:
 
 def _errors_from(path: Path, first: int) -> RunningForm:
     """Return the recorded form errors of a bag from a sample on."""
-    with Source(path) as source:
+    with BagSource(path) as source:
         errors = RunningForm.of({name: said.type for name, said in source.topics.items()})
     feed(path, [From(errors, first)])
     return errors

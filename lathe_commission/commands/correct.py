@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import RenderableType
 
 from lathe_commission import form_correction, part_record
-from lathe_commission.form_correction import Alignment, Correction, Revolution
+from lathe_commission.form_correction import Alignment, Correction, MeasuredRevolution
 from lathe_machine.signals.profile import Profile
 from lathe_machine.stages.tool.form import FormParameters
 from lathe_rc import messages
@@ -67,7 +67,7 @@ def _forms(scenario: Scenario, node: str | None) -> _Forms:
     return _Forms(corrected, desired, programmed or tables[corrected].form(corrected))
 
 
-def _of_bag(path: Path, last: int, topic: str | None) -> list[Revolution]:
+def _of_bag(path: Path, last: int, topic: str | None) -> list[MeasuredRevolution]:
     """Return the newest complete revolutions that a gauge of a recorded cell has read: form errors [m]."""
     recording = reader.read_bag(path)
     states = [name for name in recording.dense if recording.types[name] == messages.STATE]
@@ -89,7 +89,7 @@ def _of_bag(path: Path, last: int, topic: str | None) -> list[Revolution]:
     for k in whole[-last:]:
         rows = there & (turn == k)
         # A positive error is missing material.
-        found.append(Revolution(np.mod(angle[rows], _TURN), -reading["measured_position"][rows]))
+        found.append(MeasuredRevolution(np.mod(angle[rows], _TURN), -reading["measured_position"][rows]))
     if not found:
         raise InputError(f"{path}: the gauge has read no complete revolution; let it run longer")
     return found
@@ -120,7 +120,9 @@ class _Read(NamedTuple):
     left_out: list[_Outlier]
 
 
-def _clean(path: Path, revolutions: list[Revolution], highest: int, left_out: list[_Outlier]) -> list[Revolution]:
+def _clean(
+    path: Path, revolutions: list[MeasuredRevolution], highest: int, left_out: list[_Outlier]
+) -> list[MeasuredRevolution]:
     """Leave out readings that stand out (see `lathe_commission.form_correction.outliers`), and append them."""
     found = []
     for k, each in enumerate(revolutions, 1):
@@ -190,7 +192,7 @@ def _read(
     return found._replace(points=float(np.mean(points)))
 
 
-def _height(path: Path, desired: Profile, revolution: Revolution, given: float | None) -> float:
+def _height(path: Path, desired: Profile, revolution: MeasuredRevolution, given: float | None) -> float:
     """Return the height of a revolution along the part [m]; ``given``: of a record without heights [mm]."""
     if revolution.height is not None:
         return revolution.height

@@ -16,7 +16,7 @@ from lathe_rc.errors import InputError, LatheError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from lathe_commission.design import Candidate, Covered, Design, Found
+    from lathe_commission.design import Candidate, Covered, Design, WorstResult
     from lathe_rc.cell.parameters import Values
     from lathe_rc.cell.scenario import Scenario
 
@@ -160,7 +160,7 @@ def _summary(candidate: "Candidate") -> dict[str, Any]:
     covered = candidate.covered
     runs = {"nominal": candidate.nominal, "worst": candidate.worst, "other_speed": candidate.other}
 
-    def by_run(of: Callable[["Found"], float]) -> dict[str, float | None]:
+    def by_run(of: Callable[["WorstResult"], float]) -> dict[str, float | None]:
         return {name: value if math.isfinite(value := of(run)) else None for name, run in runs.items()}
 
     return {

@@ -26,7 +26,7 @@ from lathe_rc.arrays import Array
 from lathe_rc.commands import measured as measured_options
 from lathe_rc.commands import options, picture, tables
 from lathe_rc.errors import InputError, LatheError
-from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.measurement_file import MeasuredQuantities
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -140,7 +140,7 @@ class _Measured(NamedTuple):
     """Measurement of a drive with its fit."""
 
     path: Path
-    measurement: Measurement
+    measurement: MeasuredQuantities
     data: ResponseData | StepData
     fit: ModalFit
 
@@ -150,7 +150,7 @@ class _Measured(NamedTuple):
         return f"{self.path}: {_count(self.fit)}"
 
 
-def _cure(measurement: Measurement, data: ResponseData | StepData, modes: int | None, error: LatheError) -> str:
+def _cure(measurement: MeasuredQuantities, data: ResponseData | StepData, modes: int | None, error: LatheError) -> str:
     """Return why the response is another one than that of position to command, and the cure; empty: it is not known."""
     if not isinstance(data, ResponseData):
         return ""
@@ -328,7 +328,7 @@ def _told(one: _Measured, *, chosen: bool) -> Iterator[RenderableType]:
         yield f"residual: {100.0 * fit.model_error:.3g} % of the step, RMS"
 
 
-def _sign(measurement: Measurement, gain: float) -> str:
+def _sign(measurement: MeasuredQuantities, gain: float) -> str:
     """Return a hint for a negative gain."""
     if gain > 0.0:
         return ""

@@ -12,7 +12,7 @@ from rich.console import RenderableType
 
 from lathe_rc.analysis.metrology import Lay, Measurement
 from lathe_rc.bag import provenance, reader
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.cell.recording import Recording
 from lathe_rc.commands import lossy, measured, options, tables
 from lathe_rc.errors import InputError, LatheError
@@ -53,7 +53,7 @@ def _surface(bag: Path, recording: Recording, found: Measurement, nose_mm: float
     """
     if nose_mm:
         return part.surface(recording, found, nose_mm * 1e-3)
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         about = source.about
     try:
         radius = part.nose_radius(provenance.judged(about))

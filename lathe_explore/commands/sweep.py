@@ -20,7 +20,7 @@ from lathe_rc.names import pairs
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from lathe_explore.sweep.outcomes import Outcome
+    from lathe_explore.sweep.outcomes import CellsOutcome
     from lathe_explore.sweep.page import Written
     from lathe_explore.sweep.sweep import Sweep
 
@@ -177,7 +177,7 @@ def _show(found: "Sweep", goals: Sequence[str] = (), written: "Written | None" =
 def _told(
     found: "Sweep",
     summary: dict[str, Any],
-    reasons: Sequence["Outcome"],
+    reasons: Sequence["CellsOutcome"],
     goals: Sequence[str],
     written: "Written | None",
 ) -> Iterator["RenderableType"]:

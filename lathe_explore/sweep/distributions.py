@@ -20,7 +20,7 @@ _ALLOWED = (
 )
 
 
-class Drawn(NamedTuple):
+class Distribution(NamedTuple):
     """Probability distribution of a sampled parameter.
 
     Attributes:
@@ -70,7 +70,7 @@ def _scipy_law(name: str) -> Any:
     return found if isinstance(found, scipy.stats.rv_continuous | scipy.stats.rv_discrete) else None
 
 
-def drawn(scenario: Scenario, target: str, told: str) -> Drawn:
+def drawn(scenario: Scenario, target: str, told: str) -> Distribution:
     """Parse the distribution of a sampled parameter (notation: `lathe_explore.sweep.space.Space`).
 
     Raises:
@@ -100,7 +100,7 @@ def drawn(scenario: Scenario, target: str, told: str) -> Drawn:
     first, last = float(law.cdf(math.nextafter(low, -math.inf))), float(law.cdf(high))
     if not last > first or not math.isfinite(law.ppf(0.5 * (first + last))):
         raise InputError(f"{target}={shown(told)}: not defined with these arguments; allowed: as scipy.stats.{name}")
-    return Drawn(law, first, last, log, row.type is int)
+    return Distribution(law, first, last, log, row.type is int)
 
 
 def _of_two(scenario: Scenario, target: str, told: str, name: str, plain: list[str], *, log: bool) -> Any:

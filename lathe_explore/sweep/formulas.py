@@ -30,7 +30,7 @@ from lathe_machine.plants.cutting_force import SpecificForce
 from lathe_machine.stages.cut.cutting_process import CuttingProcessParameters
 from lathe_machine.stages.feed.feed_drive import FeedDriveParameters
 from lathe_machine.stages.feed.force_controller import ForceController
-from lathe_machine.stages.learning.learner import Loop
+from lathe_machine.stages.learning.learner import CheckedLoop
 from lathe_machine.stages.learning.learner import lag as drive_lag
 from lathe_machine.stages.learning.learning_controller import LearningController
 from lathe_machine.stages.learning.learning_parameters import LearningControllerParameters
@@ -52,7 +52,7 @@ _LEADS = 20  # number of leads on the grid, the best of which is refined
 _FAR = 2.0  # longest lead of the grid, in lags of the drive
 
 
-class Found(NamedTuple):
+class FormulaValue(NamedTuple):
     """Parameter value given by a formula.
 
     Attributes:
@@ -64,7 +64,7 @@ class Found(NamedTuple):
     formula: str
 
 
-def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGIN) -> dict[str, Found]:
+def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGIN) -> dict[str, FormulaValue]:
     """Return the values of all parameters that have a formula.
 
     Args:
@@ -73,7 +73,7 @@ def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGI
         margin: required stability margin 1 - sup|Q - γZ| of learning.
     """
     cell = Cell(scenario.nodes)
-    found: dict[str, Found] = {}
+    found: dict[str, FormulaValue] = {}
     for name, stage in cell.stages.items():
         free = {target.rpartition(".")[2] for target in targets if target.rpartition(".")[0] == name}
         if isinstance(stage, ForceController) and free & set(_PID):
@@ -83,7 +83,7 @@ def settings(scenario: Scenario, targets: Collection[str], margin: float = MARGI
     return {target: found[target] for target in targets if target in found}
 
 
-def _learning(cell: Cell, stage: LearningController, free: Collection[str], margin: float) -> dict[str, Found]:
+def _learning(cell: Cell, stage: LearningController, free: Collection[str], margin: float) -> dict[str, FormulaValue]:
     loop = stage.checked_loop(cell)
     if not loop.responses:
         return {}
@@ -95,30 +95,30 @@ def _learning(cell: Cell, stage: LearningController, free: Collection[str], marg
         """Return sup|Q - γZ|; infinite if the memory is too short for Q."""
         return loop.factor({"lead_time": lead, "q_time": q_time, "learning_gain": gain})
 
-    found: dict[str, Found] = {}
+    found: dict[str, FormulaValue] = {}
     lead, q_time = stage.parameters.lead_time, stage.parameters.q_time
     if "lead_time" in free:
         lag = max(map(drive_lag, loop.responses))
         if "q_time" not in free:
             lead = _least(lambda each: factor(each, q_time), _FAR * lag)
-            found["lead_time"] = Found(lead, "T0 with the least sup|Q - γZ|")
+            found["lead_time"] = FormulaValue(lead, "T0 with the least sup|Q - γZ|")
         elif _shortest(partial(factor, lag), margin) < _NONE:
             lead = lag
-            found["lead_time"] = Found(lead, "T0 = lag of the drive")
+            found["lead_time"] = FormulaValue(lead, "T0 = lag of the drive")
         else:
             lead = _least(lambda each: _shortest(partial(factor, each), margin), _FAR * lag)
-            found["lead_time"] = Found(lead, "T0 that allows the shortest q_time")
+            found["lead_time"] = FormulaValue(lead, "T0 that allows the shortest q_time")
     if "q_time" in free:
         q_time = _shortest(partial(factor, lead), margin)
         if q_time == _NONE:
             return {}
-        found["q_time"] = Found(q_time, f"shortest with sup|Q - γZ| <= {1.0 - margin:.4g}")
+        found["q_time"] = FormulaValue(q_time, f"shortest with sup|Q - γZ| <= {1.0 - margin:.4g}")
     if "learning_gain" in free:
-        found["learning_gain"] = Found(gain, _GAIN)
+        found["learning_gain"] = FormulaValue(gain, _GAIN)
     return found
 
 
-def _flat(loop: Loop, free: Collection[str], gain: float, margin: float) -> dict[str, Found]:
+def _flat(loop: CheckedLoop, free: Collection[str], gain: float, margin: float) -> dict[str, FormulaValue]:
     """Return the values for a flat Q.
 
     The lead is the lag of the drive if a flat Q with the margin exists for it, else the scenario's value.
@@ -137,12 +137,12 @@ def _flat(loop: Loop, free: Collection[str], gain: float, margin: float) -> dict
             flat = {} if loop.factor(values) <= 1.0 - margin else None
         if flat is not None:
             why = f"widest flat Q with sup|Q - γZ| <= {1.0 - margin:.4g}"
-            found = {name: Found(value, why) for name, value in flat.items() if isinstance(value, float)}
-            return {**found, "lead_time": Found(lead, told), "learning_gain": Found(gain, _GAIN)}
+            found = {name: FormulaValue(value, why) for name, value in flat.items() if isinstance(value, float)}
+            return {**found, "lead_time": FormulaValue(lead, told), "learning_gain": FormulaValue(gain, _GAIN)}
     return {}
 
 
-def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
+def _force(scenario: Scenario, stage: ForceController) -> dict[str, FormulaValue]:
     slides = [table for table in scenario.nodes.values() if isinstance(table, FeedDriveParameters)]
     slides = [table for table in slides if table.axis == "longitudinal" and table.model == "dc_screw"]
     cuts = [table for table in scenario.nodes.values() if isinstance(table, CuttingProcessParameters)]
@@ -162,7 +162,7 @@ def _force(scenario: Scenario, stage: ForceController) -> dict[str, Found]:
     except InputError:  # no PID meets these margins, so there is no formula for this plant
         return {}
     values = (gains.proportional, gains.integral, gains.derivative, gains.filter)
-    return {name: Found(value, "PID of 60° and 6 dB") for name, value in zip(_PID, values, strict=True)}
+    return {name: FormulaValue(value, "PID of 60° and 6 dB") for name, value in zip(_PID, values, strict=True)}
 
 
 def _least(cost: Callable[[float], float], longest: float) -> float:

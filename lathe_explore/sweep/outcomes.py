@@ -9,7 +9,7 @@ import pyarrow as pa
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
-class Outcome(NamedTuple):
+class CellsOutcome(NamedTuple):
     """Outcome of several cells.
 
     Attributes:
@@ -30,13 +30,13 @@ class Outcome(NamedTuple):
         return f"cell {self.cell}: {self.reason}" if self.reason else ""
 
 
-def outcomes(table: pa.Table) -> list[Outcome]:
+def outcomes(table: pa.Table) -> list[CellsOutcome]:
     """Return the outcomes of rows with the columns cell, status and reason, most frequent first."""
-    found: dict[tuple[str, str], Outcome] = {}
+    found: dict[tuple[str, str], CellsOutcome] = {}
     for row in table.select(["cell", "status", "reason"]).to_pylist():
         reason = row["reason"] or ""
         outcome = found.setdefault(
-            (row["status"], _NUMBER.sub("…", reason)), Outcome(row["status"], 0, row["cell"], reason)
+            (row["status"], _NUMBER.sub("…", reason)), CellsOutcome(row["status"], 0, row["cell"], reason)
         )
         found[row["status"], _NUMBER.sub("…", reason)] = outcome._replace(cells=outcome.cells + 1)
     return sorted(found.values(), key=lambda outcome: -outcome.cells)

@@ -27,7 +27,7 @@ _DECADES = 2.5  # length in decades up to which a logarithmic axis has ticks wit
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class ParallelFigure:
     """Parallel-coordinates figure, and the number of cells in it.
 
     Attributes:
@@ -141,7 +141,7 @@ def _axis(place: int, axis: Axis, ticks: int) -> list[Spec]:
     ]
 
 
-def parallel(axes: Sequence[Axis], goal: Goal, numbers: NDArray[np.int64]) -> Drawn:
+def parallel(axes: Sequence[Axis], goal: Goal, numbers: NDArray[np.int64]) -> ParallelFigure:
     """Return the parallel coordinates of parameters and goals.
 
     Args:
@@ -200,4 +200,4 @@ def parallel(axes: Sequence[Axis], goal: Goal, numbers: NDArray[np.int64]) -> Dr
             _mark("text", style="guide-label", x=4 - _SIDE, y=20 - _TOP, text=kept),
         ],
     }
-    return Drawn(spec, count, known)
+    return ParallelFigure(spec, count, known)

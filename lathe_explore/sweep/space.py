@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from lathe_explore.sweep.distributions import drawn, factor, number
 from lathe_explore.sweep.expression import Formulas, ordered
 from lathe_rc.cell import ros_yaml
-from lathe_rc.cell.parameters import Row, Value
+from lathe_rc.cell.parameters import ParameterRow, Value
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.errors import InputError, shown
 
@@ -254,7 +254,7 @@ def _split(text: str) -> list[str]:
     return [part.strip() for part in parts]
 
 
-def _value(scenario: Scenario, target: str, row: Row, text: str) -> Value:
+def _value(scenario: Scenario, target: str, row: ParameterRow, text: str) -> Value:
     if not row.is_list and row.type is str:
         return text.strip("'\"")
     if not row.is_list and row.type in (int, float) and text.endswith("%"):
@@ -275,14 +275,14 @@ def check_distinct(targets: Sequence[str]) -> None:
             raise InputError(f"{one} and {other} set the same parameter; allowed: one of them")
 
 
-def _plain(row: Row, value: Value) -> Value:
+def _plain(row: ParameterRow, value: Value) -> Value:
     """Return a value in its parameter's type: 1 for a real number is 1.0, so that both are the same cell."""
     if row.type is not float:
         return value
     return [float(item) for item in value] if isinstance(value, list) else float(cast("float", value))
 
 
-def _check_type(target: str, row: Row, value: Value) -> None:
+def _check_type(target: str, row: ParameterRow, value: Value) -> None:
     """Reject a value of the wrong type; a value out of range becomes an error in its cell's row."""
     kinds = (int, float) if row.type is float else row.type
     items = value if isinstance(value, list) else [value]

@@ -136,7 +136,7 @@ def _opened(path: Path, goals: int) -> tuple[JournalStorage, optuna.Study]:
         raise journal.refusal(f"{type(error).__name__}: {error}") from None
 
 
-class Study:
+class TuningStudy:
     """Tuning on disk: Optuna's study, and the rows of its trials.
 
     Attributes:

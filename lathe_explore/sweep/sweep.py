@@ -21,7 +21,7 @@ from lathe_explore.sweep import inputs, row
 from lathe_explore.sweep.alone import KILLED
 from lathe_explore.sweep.folder import Folder
 from lathe_explore.sweep.objectives import front, goal_among
-from lathe_explore.sweep.outcomes import Outcome, outcomes
+from lathe_explore.sweep.outcomes import CellsOutcome, outcomes
 from lathe_explore.sweep.space import Space, canonical
 from lathe_explore.sweep.workers import Job, Order, client_of, rows
 from lathe_rc import allowed_code
@@ -67,7 +67,7 @@ class Sweep:
         """Return the numbers of cells by status, most frequent first."""
         return dict(Counter(self.folder.table(["status"]).column("status").to_pylist()).most_common())
 
-    def outcomes(self) -> list[Outcome]:
+    def outcomes(self) -> list[CellsOutcome]:
         """Return the statuses and reasons of the cells, most frequent first."""
         return outcomes(self.folder.table(["cell", "status", "reason"]))
 

@@ -20,7 +20,7 @@ from lathe_explore.sweep.folder import Folder, Request, locked, writing
 from lathe_explore.sweep.objectives import Objectives, objectives
 from lathe_explore.sweep.search_space import Dimension, search_space
 from lathe_explore.sweep.space import Space, check_distinct
-from lathe_explore.sweep.study import Study
+from lathe_explore.sweep.study import TuningStudy
 from lathe_explore.sweep.sweep import Watch, crew_for, ignore
 from lathe_explore.sweep.tuning import Tuning
 from lathe_rc.cell.parameters import Value
@@ -113,7 +113,7 @@ def tune(
         formulas=ask_formulas,
     )
     kept = Folder.begin(Path(folder), scenario, None, wanted.measures, request)
-    state = Study(kept)
+    state = TuningStudy(kept)
     with locked(kept.path / "tune.lock", wait=False), ExitStack() as stack:
         there = state.count_trials()
         watch({"event": "began", "cells": trials * state.count, "computed": there * state.count, "trials": there})
@@ -153,4 +153,4 @@ def load(path: Path) -> Tuning:
     folder = Folder(path)
     if folder.tuning is None:
         raise InputError(f"{path} holds a sweep; allowed: a folder that lathe tune has written")
-    return Study(folder).tuning()
+    return TuningStudy(folder).tuning()

@@ -11,7 +11,7 @@ import numpy as np
 
 from lathe_explore.sweep import row
 from lathe_explore.sweep.folder import Folder, writing
-from lathe_explore.sweep.formulas import Found
+from lathe_explore.sweep.formulas import FormulaValue
 from lathe_explore.sweep.objectives import Objectives, Score, front
 from lathe_explore.sweep.space import Space
 from lathe_explore.sweep.sweep import Sweep
@@ -51,7 +51,7 @@ class Tuning:
     objectives: Objectives
     over: Space
     trials: Sequence[Trial]
-    formulas: Mapping[str, Found] = field(default_factory=dict)
+    formulas: Mapping[str, FormulaValue] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         """Return the scenario and its best trial as a string."""

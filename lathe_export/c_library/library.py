@@ -20,7 +20,7 @@ from lathe_export.c_library.step_memory import Place, leaves
 from lathe_rc import messages
 from lathe_rc.blocks.columns import units
 from lathe_rc.cell import events
-from lathe_rc.cell.parameters import Row, explain_overflow, remapped
+from lathe_rc.cell.parameters import ParameterRow, explain_overflow, remapped
 from lathe_rc.cell.stage import Stage
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.compiled.struct_view import address
@@ -111,7 +111,7 @@ class Tape(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Part:
+class LibraryStage:
     """Stage of a library.
 
     Attributes:
@@ -191,7 +191,7 @@ class Library:
     inputs: list[Signal] = field(default_factory=list)
     outputs: list[Signal] = field(default_factory=list)
     parameters: list[Parameter] = field(default_factory=list)
-    parts: list[Part] = field(default_factory=list)
+    parts: list[LibraryStage] = field(default_factory=list)
     tapes: list[Tape] = field(default_factory=list)
     streams: list[Stream] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -345,7 +345,7 @@ class Library:
             self.parameters.append(self._parameter(stage, name, [state + place for place in memory.offsets(name)]))
         outputs = [signal.tape for signal in self.outputs]
         written = [outputs.index(tape) for tape in writes]
-        self.parts.append(Part(stage, symbol, code, arrays, state, 0, 0, reads, written))
+        self.parts.append(LibraryStage(stage, symbol, code, arrays, state, 0, 0, reads, written))
 
     # ---- parameters ---------------------------------------------------------------------------------
 
@@ -403,7 +403,7 @@ class Library:
         return True
 
 
-def _ends(row: Row) -> tuple[float, float]:
+def _ends(row: ParameterRow) -> tuple[float, float]:
     """Return the smallest and largest value in the range of a parameter."""
     low = nextafter(row.low, inf) if "above" in row.limits else max(row.low, -_HUGE)
     return low, nextafter(row.high, -inf) if "below" in row.limits else min(row.high, _HUGE)

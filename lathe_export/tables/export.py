@@ -14,7 +14,7 @@ from lathe_export.tables import message_rows
 from lathe_export.tables.formats import FORMATS, Format, Rows
 from lathe_export.tables.message_rows import is_known
 from lathe_rc import messages
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.stream import BagHeader, feed, first_of
 from lathe_rc.blocks.columns import Column, columns, dense_rows, sparse_rows
 from lathe_rc.blocks.ports import Sparse
@@ -108,7 +108,7 @@ class Exporter:
         self._target.finish()
         return {topic: table.rows for topic, table in self._tables.items()}
 
-    def left_out(self, source: Source, header: BagHeader) -> list[str]:
+    def left_out(self, source: BagSource, header: BagHeader) -> list[str]:
         """Return what was not passed on of the blocks and messages of a bag, one line each."""
         first, said = first_of(source), list[str]()
         for topic, table in self._tables.items():
@@ -124,7 +124,7 @@ class Exporter:
         return said
 
 
-def _selected(source: Source, wanted: Sequence[str]) -> dict[str, str]:
+def _selected(source: BagSource, wanted: Sequence[str]) -> dict[str, str]:
     """Return the message types of the topics to export, by name.
 
     Without topics that are asked for: those with signals of a cell or, in a bag without blocks, all.
@@ -153,7 +153,7 @@ def _selected(source: Source, wanted: Sequence[str]) -> dict[str, str]:
     return chosen
 
 
-def _step_ns(source: Source) -> int:
+def _step_ns(source: BagSource) -> int:
     """Return the sampling step of the run [ns]; 0 if the bag has no block."""
     dense = [topic for topic, found in source.topics.items() if found.type in messages.block_types()]
     return next((step_ns for topic in dense if (step_ns := source.step_ns(topic))), 0)
@@ -192,7 +192,7 @@ def export_bag(
     _refuse_existing(place)
     if not place.absolute().parent.is_dir():
         raise InputError(f"{place}: no such folder {place.absolute().parent}; make it first")
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         types, step_ns = _selected(source, topics), _step_ns(source)
         signals = {topic: kind for topic, kind in types.items() if step_ns and kind in messages.signal_types()}
         others = [] if topics else sorted(source.topics.keys() - types.keys())

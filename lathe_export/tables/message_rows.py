@@ -9,7 +9,7 @@ from rosbags.interfaces import Nodetype
 
 from lathe_export.tables.formats import Format
 from lathe_rc import messages
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.blocks.columns import MOST_COLUMNS, TEXT, Column, flattened
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples
@@ -36,7 +36,7 @@ def _row(msgtype: str, log_ns: int, data: bytes) -> dict[str, Cell]:
     return row | {name: (value, dtype) for name, value, dtype in parts if not name.startswith("header.stamp.")}
 
 
-def _rows(source: Source, topic: str) -> Iterator[dict[str, Cell]]:
+def _rows(source: BagSource, topic: str) -> Iterator[dict[str, Cell]]:
     """Yield the columns of each message of a topic.
 
     Raises:
@@ -51,7 +51,7 @@ def _rows(source: Source, topic: str) -> Iterator[dict[str, Cell]]:
             raise kind(f"{source.path}: {topic} at {log_ns} ns: {shown(error)}") from None
 
 
-def _columns(source: Source, topic: str) -> list[Column]:
+def _columns(source: BagSource, topic: str) -> list[Column]:
     """Return the columns of all messages of a topic, in the order of the fields.
 
     A number that some messages lack becomes a double, which is NaN there.
@@ -79,7 +79,7 @@ def _columns(source: Source, topic: str) -> list[Column]:
     return found
 
 
-def export(source: Source, topic: str, target: Format) -> int:
+def export(source: BagSource, topic: str, target: Format) -> int:
     """Write the table of a topic and return the number of its rows.
 
     Raises:

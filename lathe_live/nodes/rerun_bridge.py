@@ -10,7 +10,7 @@ from rclpy.signals import SignalHandlerOptions
 from lathe_live.live_runs import ShownRun
 from lathe_live.nodes.listener import Listener
 from lathe_live.rerun_live import Live
-from lathe_live.rerun_output import Output, require
+from lathe_live.rerun_output import LiveOutput, require
 from lathe_rc.cell import scenario
 from lathe_rc.cell.beside import RERUN_BRIDGE as KIND
 from lathe_rc.cell.beside import RerunBridgeParameters
@@ -35,7 +35,7 @@ def run(values: Mapping[str, object], args: Sequence[str]) -> list[ShownRun]:
     signals = SignalHandlerOptions.NO
     with standalone_node(KIND, RerunBridgeParameters, values, args, signals=signals) as (node, parameters):
         known = scenario.load(parameters.scenario) if parameters.scenario else None
-        output = Output(parameters.output, file=Path(parameters.file), url=parameters.url, port=parameters.port)
+        output = LiveOutput(parameters.output, file=Path(parameters.file), url=parameters.url, port=parameters.port)
         with output:
             live = Live(output.open, rate=parameters.rate, say=node.get_logger().info, scenario=known)
             bridge = Listener(node, live, lambda: output.ended or bool(parameters.once and live.shown))

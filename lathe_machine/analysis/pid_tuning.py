@@ -60,7 +60,7 @@ def response(plant: Plant, frequency: npt.ArrayLike) -> Complex:
 
 
 @dataclass(frozen=True)
-class Loop:
+class TunedLoop:
     """Margins and closed-loop step response of a loop.
 
     Attributes:
@@ -100,7 +100,7 @@ def closed_loop(plant: Plant, gains: PidGains, wait: float = 0.0) -> Lti:
     return control.feedback(state_space(plant) * state_space(gains.transfer) * delay(wait))
 
 
-def evaluate(plant: Plant, gains: PidGains, wait: float = 0.0) -> Loop:
+def evaluate(plant: Plant, gains: PidGains, wait: float = 0.0) -> TunedLoop:
     """Compute margins and step response of a loop with a PID.
 
     Args:
@@ -115,7 +115,7 @@ def evaluate(plant: Plant, gains: PidGains, wait: float = 0.0) -> Loop:
     poles = closed.poles()
     stable = bool(np.all(poles.real < 0.0))
     rise, settling, overshoot = _step(closed, poles) if stable else (np.nan, np.nan, np.nan)
-    return Loop(
+    return TunedLoop(
         rise, settling, overshoot, float(gain), float(at_gain), float(np.radians(phase)), float(at_phase), stable
     )
 

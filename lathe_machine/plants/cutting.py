@@ -46,7 +46,7 @@ from lathe_machine.plants.chip import (
     pressed_by,
 )
 from lathe_machine.plants.cutting_force import RIGID, STEEL, Elasticity, Flank, SpecificForce, Wear
-from lathe_machine.plants.workpiece import HardSpot, Part, spot_rows
+from lathe_machine.plants.workpiece import HardSpot, Workpiece, spot_rows
 from lathe_machine.transfer import System, TransferFunction, discretise, rest
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
@@ -133,7 +133,7 @@ class CuttingProcess:
         lag: float = 0.075,
         elasticity: Elasticity = RIGID,
         wear: Wear = _NEW_EDGE,
-        part: Part | None = None,
+        part: Workpiece | None = None,
         overlap: float = 0.0,
         grid: int = 4096,
         flank: Flank = _NO_DAMPING,
@@ -147,7 +147,7 @@ class CuttingProcess:
         if grid < 16:
             raise InputError(f"cutting: {grid} grid points in a revolution; allowed: 16 or more")
         _check_edge(material, wear, flank, elasticity)
-        part = part or Part()
+        part = part or Workpiece()
         following = discretise(TransferFunction((1.0,), (lag, 1.0)), step, "foh")
         mode = discretise(elasticity.shape, step, "foh")
         heights, compliances = part.heights, part.compliances

@@ -42,7 +42,7 @@ class DriftTable(NamedTuple):
     drives: Array
 
 
-class State(NamedTuple):
+class DriftState(NamedTuple):
     """State of a drifting drive at a time [s]: factors of its gain and of the frequencies of its modes."""
 
     time: float
@@ -76,11 +76,11 @@ class Drift:
                 f"modes that move by {abs(self.modes) * self.end:.0%}; allowed: by {_FARTHEST:.0%} or less"
             )
 
-    def states(self) -> list[State]:
+    def states(self) -> list[DriftState]:
         """Return states along the drift at equal distances, the start first; it alone without a drift."""
         parts = max(math.ceil(abs(self.modes) * self.end / _APART), 1) if self.gain or self.modes else 0
         times = [self.end * k / max(parts, 1) for k in range(parts + 1)]
-        return [State(time, 1.0 + self.gain * time, 1.0 + self.modes * time) for time in times]
+        return [DriftState(time, 1.0 + self.gain * time, 1.0 + self.modes * time) for time in times]
 
     def table(self, drives: list[Array], step: float) -> DriftTable:
         """Return the table for kernels.

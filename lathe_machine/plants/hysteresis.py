@@ -40,14 +40,14 @@ PROPORTIONAL = 0.7617
 _LINEAR, PLAYS, _BOUC_WEN, _BOUC_WEN_INVERSE = 0, 1, 2, 3  #: kinds of a `Law`
 
 
-class Law(NamedTuple):
+class OperatorTable(NamedTuple):
     """Kind and constants of a hysteresis operator for kernels; the state is a separate array."""
 
     kind: int
     table: Array
 
 
-LINEAR = Law(_LINEAR, np.empty((0, 0)))  #: output = input; without state
+LINEAR = OperatorTable(_LINEAR, np.empty((0, 0)))  #: output = input; without state
 
 
 @kernel
@@ -140,7 +140,7 @@ def advance(kind: int, table: Array, state: Array, start: int, value: float) -> 
     """Step an operator to the input ``value``; return the output and update ``state``.
 
     Args:
-        kind: kind of the operator, see `Law`.
+        kind: kind of the operator, see `OperatorTable`.
         table: constants of the operator: for plays, rows of thresholds (the first is 0) and weights (the first is p0);
             for Bouc-Wen, A, β, γ and g.
         state: array that contains the positions of the plays, or u and h, from ``start`` on.
@@ -218,7 +218,7 @@ class Hysteresis:
         steepest: largest possible slope dy/du.
     """
 
-    def __init__(self, law: Law, state: Array, steepest: float) -> None:
+    def __init__(self, law: OperatorTable, state: Array, steepest: float) -> None:
         self.law, self.state, self.steepest = law, state, steepest
 
     def block(self, value: Array, result: Array) -> None:
@@ -237,12 +237,14 @@ def check_thresholds(thresholds: Array) -> None:
         raise InputError(f"play thresholds {thresholds.tolist()}; allowed: above 0 and increasing")
 
 
-def _weighted(thresholds: Array, weights: Array, proportional: float, state: Array) -> tuple[Law, Array, float]:
+def _weighted(
+    thresholds: Array, weights: Array, proportional: float, state: Array
+) -> tuple[OperatorTable, Array, float]:
     """Return the law, state and steepest slope of play operators in a given state."""
     table = np.empty((2, thresholds.size + 1))
     # The contributions of moving plays add up, so the steepest slope is the largest partial sum.
     table[:, 0], table[0, 1:], table[1, 1:] = (0.0, proportional), thresholds, weights
-    return Law(PLAYS, table), state, float(np.cumsum(table[1]).max())
+    return OperatorTable(PLAYS, table), state, float(np.cumsum(table[1]).max())
 
 
 class PrandtlIshlinskii(Hysteresis):
@@ -323,7 +325,7 @@ class BoucWen(Hysteresis):
         self.a, self.beta, self.gamma = a, beta, gamma
         self.gain = 1.0 / (1.0 - self._end_of_loop()) if gain is None else gain
         table = np.array([[a, beta, gamma, self.gain]])
-        super().__init__(Law(_BOUC_WEN, table), np.zeros(2), self.gain)
+        super().__init__(OperatorTable(_BOUC_WEN, table), np.zeros(2), self.gain)
 
     def _end_of_loop(self) -> float:
         """Return the hysteretic part at the end of a steady loop over ±1, where a travel of 2 inverts its sign."""
@@ -354,4 +356,6 @@ class BoucWenInverse(Hysteresis):
     """
 
     def __init__(self, forward: BoucWen) -> None:
-        super().__init__(Law(_BOUC_WEN_INVERSE, forward.law.table), forward.state.copy(), 1.0 / forward.flattest)
+        super().__init__(
+            OperatorTable(_BOUC_WEN_INVERSE, forward.law.table), forward.state.copy(), 1.0 / forward.flattest
+        )

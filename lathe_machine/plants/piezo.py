@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lathe_machine.plants.hysteresis import LINEAR, Hysteresis, Law, advance, advance_along
+from lathe_machine.plants.hysteresis import LINEAR, Hysteresis, OperatorTable, advance, advance_along
 from lathe_machine.plants.linear import Constant, DiscretePlant, Discretisation, discretise, second_order
 from lathe_rc.arrays import Array, Complex, Integers
 from lathe_rc.errors import InputError
@@ -46,9 +46,9 @@ class StackTable(NamedTuple):
     """
 
     stroke: float
-    inverse: Law
+    inverse: OperatorTable
     inverse_size: int
-    forward: Law
+    forward: OperatorTable
     decay: float
     now: float
     before: float

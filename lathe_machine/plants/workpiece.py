@@ -52,7 +52,7 @@ def _check_window(what: str, start: float, width: float) -> None:
 
 
 @dataclass(frozen=True)
-class Part:
+class Workpiece:
     """Properties of the part that affect the cut.
 
     Attributes:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lathe_machine.safety.rules import GROWTH, INDEX, RATE, SUMS, THRESHOLD, TURN, Watch, clear
+from lathe_machine.safety.rules import GROWTH, INDEX, RATE, SUMS, THRESHOLD, TURN, MonitorTable, clear
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import code_of_others
@@ -280,7 +280,7 @@ class Lookout:
             other = numbers[monitor.other] if monitor.other else -1
             row[:] = monitor.rule.number, numbers[monitor.signal], other, begin, end
             monitor.memory = memory[begin:end]
-        self.watch = Watch(plan, memory, np.zeros(count, np.int64), np.full(count, -1), np.zeros(count))
+        self.watch = MonitorTable(plan, memory, np.zeros(count, np.int64), np.full(count, -1), np.zeros(count))
 
     def found(self) -> list[tuple[Monitor, Alarm]]:
         """Return the alarms of the last call of `lathe_machine.safety.rules.walk`, in sample order."""

@@ -30,7 +30,7 @@ def refusal(state: State, reaction: Reaction) -> str:
 
 
 @dataclass(frozen=True)
-class Step:
+class OperatorStep:
     """Step of the operator.
 
     Attributes:
@@ -44,11 +44,11 @@ class Step:
     due: bool = True
 
 
-def retraction(state: State) -> Step:
+def retraction(state: State) -> OperatorStep:
     """Return what a retraction would do in a state of the cell."""
     if state in (State.RETRACTING, State.SAFE):
-        return Step("the tool is out of the part" if state is State.SAFE else "the tool is on its way out")
-    return Step("takes the tool out of the part; the feeds stop", allowed=True)
+        return OperatorStep("the tool is out of the part" if state is State.SAFE else "the tool is on its way out")
+    return OperatorStep("takes the tool out of the part; the feeds stop", allowed=True)
 
 
 def reset(
@@ -57,7 +57,7 @@ def reset(
     alarms: Sequence[str],
     faults: Sequence[str] = (),
     memories: Collection[str] = (),
-) -> Step:
+) -> OperatorStep:
     """Return whether a reset is accepted, what to do before, and why the alarm would be raised again otherwise.
 
     Args:
@@ -69,9 +69,9 @@ def reset(
     """
     if why := refusal(state, reaction):
         stuck = state is State.RETRACTING and faults
-        return Step(f"repair {_listed(faults)}, with which the tool may not come out; {why}" if stuck else why)
+        return OperatorStep(f"repair {_listed(faults)}, with which the tool may not come out; {why}" if stuck else why)
     if reaction is Reaction.NONE:
-        return Step("nothing to reset", due=False)
+        return OperatorStep("nothing to reset", due=False)
     before, reasons = [], []
     if faults:
         before.append(f"repair {_listed(faults)}")
@@ -85,9 +85,9 @@ def reset(
     does = "the tool approaches the part again" if state is State.SAFE else "the alarm is taken back"
     if not before:
         lasts = "the monitors watch on" if set(alarms) <= {OPERATOR} else "the alarm is raised again if its cause lasts"
-        return Step(f"reset: {does}; {lasts}", allowed=True)
+        return OperatorStep(f"reset: {does}; {lasts}", allowed=True)
     again = "the tool may be retracted again" if reaction is Reaction.RETRACT else "the alarm may be raised again"
-    return Step(f"{', '.join(before)}, then reset; otherwise {again}: {', '.join(reasons)}", allowed=True)
+    return OperatorStep(f"{', '.join(before)}, then reset; otherwise {again}: {', '.join(reasons)}", allowed=True)
 
 
 def _listed(names: Sequence[str]) -> str:

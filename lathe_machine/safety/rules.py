@@ -254,7 +254,7 @@ def _growing(error: Array, pulse: Pulses, at: int, memory: Array) -> int:
         begin, at = at, _next(pulse, at + 1)
 
 
-class Watch(NamedTuple):
+class MonitorTable(NamedTuple):
     """Table of the monitors of a cell for `walk`.
 
     Attributes:
@@ -273,7 +273,7 @@ class Watch(NamedTuple):
 
 
 @kernel
-def walk(watch: Watch, signals: tuple[Array, ...], angle: Array, pulse: Pulses) -> int:
+def walk(watch: MonitorTable, signals: tuple[Array, ...], angle: Array, pulse: Pulses) -> int:
     """Run all monitors over a block, fill in the sample and value of each finding, and return the number of findings.
 
     Args:

@@ -16,7 +16,7 @@ from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
 from lathe_rc.signals.checks import stacked
-from lathe_rc.signals.noise import Drawn, NormalStream
+from lathe_rc.signals.noise import DrawnNumbers, NormalStream
 
 PAPER_RMS = 20.7e-6  #: RMS of the allowance in paper 004 [m]
 
@@ -83,7 +83,7 @@ class AllowanceTable(NamedTuple):
 
     walk: Walk
     run_out: Array
-    normal: Drawn
+    normal: DrawnNumbers
     state: Array
 
 

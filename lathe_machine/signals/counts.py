@@ -22,7 +22,7 @@ from lathe_machine.signals.edge_time import COUNT, STAMP, edge_table, pass_edge,
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.signals.quantities import rank, unit_of
-from lathe_rc.signals.table import Table
+from lathe_rc.signals.table import TextTable
 
 #: time [ns], counter and, with edge times, that of the last edge [ns]; an integer counter as int, for all its digits
 Reading = tuple[int, int | float] | tuple[int, int | float, int]
@@ -116,7 +116,7 @@ class CsvReader(Reader):
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        table = Table(path, _column)
+        table = TextTable(path, _column)
         columns: dict[str, str] = {}
         units: dict[str, str] = {}
         for name, below in zip_longest(table.names, table.units, fillvalue=""):

@@ -26,7 +26,7 @@ from lathe_machine.safety.monitors import (
     rate,
     threshold,
 )
-from lathe_machine.safety.rules import Watch, clear, walk
+from lathe_machine.safety.rules import MonitorTable, clear, walk
 from lathe_machine.stages.drive.drive import Drive
 from lathe_machine.stages.learning.learner import Learner
 from lathe_rc import messages
@@ -142,7 +142,7 @@ class Memory(NamedTuple):
         state: state of the cell, reaction in force, and whether there is something to publish.
     """
 
-    watch: Watch
+    watch: MonitorTable
     clearance: Samples
     out: int
     state: Integers

@@ -58,7 +58,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ExampleOutcome:
     """Results of one run of the example.
 
     Attributes:
@@ -74,7 +74,7 @@ class Outcome:
     controller: PeriodicController
 
 
-def simulate(case: Case, drive: Array) -> Outcome:
+def simulate(case: Case, drive: Array) -> ExampleOutcome:
     """Simulate the example from rest.
 
     Args:
@@ -111,7 +111,7 @@ def simulate(case: Case, drive: Array) -> Outcome:
         if period < SHOWN:
             every = max(time.size // _POINTS, 1)
             curves.append(np.stack((at, wanted, output, command, disturbance(at)))[:, ::every])
-    return Outcome(errors, integrals, np.concatenate(curves, axis=1), controller)
+    return ExampleOutcome(errors, integrals, np.concatenate(curves, axis=1), controller)
 
 
 def limited_ideal_error(drive: Array, limit: float, step: float) -> float:

@@ -40,7 +40,7 @@ HIGHEST = (3e4, 2e5)  #: upper limit of the frequencies in sup|Q - Z|, coarse an
 
 
 @dataclass(frozen=True)
-class Tuning:
+class TuningParameters:
     """Tuning parameters of the coarse and the fine channel."""
 
     coarse: Channel
@@ -63,12 +63,12 @@ class Tuning:
         return coarse, fine
 
 
-START = Tuning(
+START = TuningParameters(
     Channel(natural_frequency=1038.0, damping=0.804, delay=0.36e-3, lead_time=1.425e-3, q_time=67.0e-6),
     Channel(natural_frequency=14_600.0, damping=0.299, delay=0.0, lead_time=97.0e-6, q_time=38.2e-6),
 )
-PLAIN = Tuning(replace(START.coarse, q_time=66.9e-6), START.fine)  #: result of `nearest`
-LEAD_LAG = Tuning(
+PLAIN = TuningParameters(replace(START.coarse, q_time=66.9e-6), START.fine)  #: result of `nearest`
+LEAD_LAG = TuningParameters(
     Channel(
         natural_frequency=782.0,
         damping=0.603,
@@ -98,7 +98,7 @@ _STABILITY_GRIDS = (
 _STEPS = ((1.0, 1e-3, 1e-6, 1e-7), (100.0, 1e-3, 1e-6, 1e-7))  # last digits of START, coarse and fine
 
 
-def _vector(tuning: Tuning) -> Array:
+def _vector(tuning: TuningParameters) -> Array:
     return np.array(
         [
             value
@@ -114,7 +114,7 @@ def _vector(tuning: Tuning) -> Array:
     )
 
 
-def _tuning(vector: Array) -> Tuning:
+def _tuning(vector: Array) -> TuningParameters:
     def channel(part: Array, delay: float) -> Channel:
         natural_frequency, damping, net_lead, q_time, lead, lag = map(float, part)
         # Sums and products of rounded numbers have rounding errors in the last digits; 15 digits are exact.
@@ -122,17 +122,17 @@ def _tuning(vector: Array) -> Tuning:
         return Channel(natural_frequency, damping, delay, lead_time, q_time, (lead, lag))
 
     # The delays of START are kept: Z depends only on the lead minus the delay.
-    return Tuning(channel(vector[:_FIELDS], START.coarse.delay), channel(vector[_FIELDS:], START.fine.delay))
+    return TuningParameters(channel(vector[:_FIELDS], START.coarse.delay), channel(vector[_FIELDS:], START.fine.delay))
 
 
 _UNITS = np.where(_vector(START) > 0.0, _vector(START), _LAG_UNIT)
 
 
-def _acceptable(tuning: Tuning, limits: Array, margin: float) -> bool:
+def _acceptable(tuning: TuningParameters, limits: Array, margin: float) -> bool:
     return bool(np.all(np.abs(tuning.deviations()) <= limits[:, None])) and max(tuning.suprema()) <= 1.0 - margin
 
 
-def _digit_changes(count: int) -> Iterator[Tuning]:
+def _digit_changes(count: int) -> Iterator[TuningParameters]:
     """Yield all tunings that differ from `START` by ``count`` steps in last digits, without lead-lag."""
     places = [(i, step) for i, step in enumerate(_STEPS[0])]
     places += [(_FIELDS + i, step) for i, step in enumerate(_STEPS[1])]
@@ -144,7 +144,7 @@ def _digit_changes(count: int) -> Iterator[Tuning]:
         yield _tuning(np.array([float(f"{value:.12g}") for value in vector]))
 
 
-def nearest(limits: Array = LIMITS, margin: float = 0.03, changes: int = 3) -> Tuning:
+def nearest(limits: Array = LIMITS, margin: float = 0.03, changes: int = 3) -> TuningParameters:
     """Return the tuning without lead-lag that meets the limits with the fewest last-digit steps from `START`.
 
     Args:
@@ -208,7 +208,7 @@ def smallest_deviation(
     digits: int = 3,
     starts: int = 24,
     seed: int = 0,
-) -> Tuning:
+) -> TuningParameters:
     """Return the rounded tuning that minimises the largest deviation from the printed table.
 
     The log ratio is minimised in the minimax sense by sequential quadratic programming from random starts. The

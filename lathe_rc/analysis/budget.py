@@ -29,7 +29,7 @@ TOLD = 0.01  #: smallest share of the interactions at which they are reported pa
 
 
 @dataclass(frozen=True)
-class Part:
+class Share:
     """Contribution of a cause, or of an interaction of causes, to the form error.
 
     Attributes:
@@ -70,15 +70,15 @@ class Budget:
     revolutions: int
     rms: float
     largest: float
-    causes: Sequence[Part]
-    rest: Part
-    interactions: Part
-    pairs: Sequence[Part] = ()
+    causes: Sequence[Share]
+    rest: Share
+    interactions: Share
+    pairs: Sequence[Share] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
     growth: Growth | None = None
 
     @property
-    def rows(self) -> list[Part]:
+    def rows(self) -> list[Share]:
         """Return the rows of a table: causes, rest, interactions, and the pairs with a share of `TOLD` or more."""
         return [*self.causes, self.rest, self.interactions, *(pair for pair in self.pairs if abs(pair.share) >= TOLD)]
 
@@ -157,9 +157,9 @@ class Decomposition:
         whole, rest = runs[frozenset(self._needs)], runs[frozenset()]
         power = float(np.mean(whole**2))
 
-        def part(name: str, signal: Array) -> Part:
+        def part(name: str, signal: Array) -> Share:
             share = float(np.mean(signal * whole)) / power if power else 0.0
-            return Part(name, share, float(np.sqrt(np.mean(signal**2))), float(np.abs(signal).max()))
+            return Share(name, share, float(np.sqrt(np.mean(signal**2))), float(np.abs(signal).max()))
 
         alone = {}
         for cause in self._needs:

@@ -29,7 +29,7 @@ import scipy
 
 from lathe_rc.arrays import Array, Complex
 from lathe_rc.errors import InputError, at_most
-from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.measurement_file import MeasuredQuantities
 from lathe_rc.signals.table import write_table
 
 Hold = Literal["linear", "zero", "none"]
@@ -390,7 +390,7 @@ def _held(cycles: Array, hold: Hold) -> Complex:
     return np.asarray(np.sinc(cycles) ** 2, np.complex128)
 
 
-def of_states(measurement: Measurement) -> list[FrequencyResponse]:
+def of_states(measurement: MeasuredQuantities) -> list[FrequencyResponse]:
     """Return the frequency responses in a file, one for each number in its column ``state``, if it has one.
 
     Raises:
@@ -403,7 +403,7 @@ def of_states(measurement: Measurement) -> list[FrequencyResponse]:
 
 
 def of_measurement(
-    measurement: Measurement, averages: float | None = None, rows: npt.NDArray[np.bool_] | None = None
+    measurement: MeasuredQuantities, averages: float | None = None, rows: npt.NDArray[np.bool_] | None = None
 ) -> FrequencyResponse:
     """Return the frequency response in a file.
 
@@ -452,7 +452,7 @@ def of_measurement(
         raise InputError(f"{measurement.name}: {error}") from None
 
 
-def _values(measurement: Measurement) -> tuple[Array, Complex]:
+def _values(measurement: MeasuredQuantities) -> tuple[Array, Complex]:
     """Return the frequencies and the complex response in a file, shape (n,) each."""
     if "real" in measurement and "imaginary" in measurement:
         frequency, real, imaginary = measurement.read("frequency", "real", "imaginary")
@@ -467,7 +467,7 @@ def _values(measurement: Measurement) -> tuple[Array, Complex]:
     raise measurement.lacking("frequency with magnitude and phase, with real and imaginary, or a complex response")
 
 
-def _between(measurement: Measurement, quantity: str, most: float) -> Array | None:
+def _between(measurement: MeasuredQuantities, quantity: str, most: float) -> Array | None:
     """Return a quantity between 0 and ``most``, one value a frequency; None if the measurement lacks it."""
     if quantity not in measurement:
         return None

@@ -51,7 +51,7 @@ _N, _SUM, _LOW, _HIGH, _MEAN, _SQUARE, _UPPER, _LOWER, _HELD, _GLITCH, _COLUMNS 
 
 
 @dataclass(frozen=True)
-class Step:
+class SetPointStep:
     """Answer of a loop to a change of its set point.
 
     Attributes:
@@ -89,7 +89,7 @@ class Steady:
 
 
 @dataclass(frozen=True)
-class Limits:
+class LimitUse:
     """Use of the limits of a command at a constant set point.
 
     Attributes:
@@ -133,9 +133,9 @@ class LoopErrors:
     mean: Array
     saturated: Array
     held: Array
-    limits: Limits | None
+    limits: LimitUse | None
     steady: Steady | None
-    step: Step | None
+    step: SetPointStep | None
     reversals: int
     glitch: float
 
@@ -283,7 +283,7 @@ class RunningLoop:
         if state[_FOUND]:
             band = self._tolerance or BAND * abs(float(state[_BY]))
             settling = int(state[_SETTLED]) if state[_SETTLED] >= 0.0 else None
-            step = Step(int(state[_STEP]), float(state[_BY]), float(state[_OVER]), settling, band)
+            step = SetPointStep(int(state[_STEP]), float(state[_BY]), float(state[_OVER]), settling, band)
         return LoopErrors(
             errors,
             rows[:, _MEAN] / count,
@@ -304,7 +304,7 @@ def _steady(rows: Array, last: int) -> Steady:
     return Steady((last - len(rows) + 1, last), between, float(wanted - error), float(error), deviation)
 
 
-def _limits(rows: Array, before: int) -> Limits | None:
+def _limits(rows: Array, before: int) -> LimitUse | None:
     """Return the use of the limits in the last rows with the same set point, at most half of the rows."""
     if not len(rows):
         return None
@@ -313,4 +313,4 @@ def _limits(rows: Array, before: int) -> Limits | None:
     if start == len(rows):
         return None
     upper, lower, held = rows[start:, [_UPPER, _LOWER, _HELD]].sum(axis=0) / rows[start:, _N].sum()
-    return Limits(start + 1 + before, float(upper), float(lower), float(held))
+    return LimitUse(start + 1 + before, float(upper), float(lower), float(held))

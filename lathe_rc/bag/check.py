@@ -14,7 +14,7 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.loss import held
 from lathe_rc.bag.reading import sound_records
 from lathe_rc.bag.reading.limits import SIMULATED
-from lathe_rc.bag.reading.source import Source, files_of
+from lathe_rc.bag.reading.source import BagSource, files_of
 from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.snapshot import first_sample, span_of
 from lathe_rc.blocks.block import Block
@@ -151,7 +151,7 @@ def check(path: Path) -> Findings:
         InputError: the path is not a bag, or the bag is damaged and needs `lathe_rc.bag.repairing.recover`.
     """
     findings, digester = Findings(), Digester()
-    with Source(path, altered=True) as source:
+    with BagSource(path, altered=True) as source:
         types = {topic: said.type for topic, said in source.topics.items()}
         part, findings.first = span_of(source.about), first_sample(source.about)
         dense = {t: _Dense(t, k, findings, digester) for t, k in types.items() if k in messages.block_types()}

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lathe_rc import messages
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.stream import ALL, feed
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.recording import Recording, SparseTopic
@@ -64,7 +64,7 @@ def read_bag(path: str | os.PathLike[str], *, whole: bool = False) -> Recording:
             for message in found.sparse.get(topic, ()):
                 sparse[topic].append(START_NS + message.index * header.step_ns, message.values)
     if not dense and sparse:  # without blocks, the log states the times
-        with Source(Path(path)) as source:
+        with BagSource(Path(path)) as source:
             for topic, log_ns, data in source.messages(set(sparse)):
                 try:
                     sparse[topic].append(log_ns, messages.values_of(header.types[topic], data))

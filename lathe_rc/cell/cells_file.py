@@ -8,7 +8,7 @@ from lathe_rc.cell import ros_yaml
 from lathe_rc.cell.parameters import Value
 from lathe_rc.errors import InputError
 from lathe_rc.signals.quantities import Mapped
-from lathe_rc.signals.table import Table, read_text
+from lathe_rc.signals.table import TextTable, read_text
 
 
 def read(
@@ -45,7 +45,7 @@ def _of_yaml(path: Path, carried: Collection[str]) -> list[dict[str, Value]]:
 
 
 def _of_table(path: Path, carried: Collection[str]) -> list[dict[str, Value]]:
-    table = Table(path)
+    table = TextTable(path)
     found: list[dict[str, Value]] = []
     for line, row in table.texts(table.names, raw=carried):
         cell: dict[str, Value] = {}

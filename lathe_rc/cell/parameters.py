@@ -59,7 +59,7 @@ def parameter(default: Any, doc: str, unit: str = "1", *, path: bool = False, dr
     return Field(default=default, description=doc, json_schema_extra={"unit": unit, "path": path, "drive": drive})
 
 
-class Row:
+class ParameterRow:
     """Row of a parameter listing, as shown to users and in ROS.
 
     Attributes:
@@ -111,7 +111,7 @@ class Row:
                 words.append("not empty")
         self.limits = " ".join(words)
 
-    def element(self) -> "Row":
+    def element(self) -> "ParameterRow":
         """Return the row for a single element of a list parameter."""
         found = copy.copy(self)
         found.is_list = False
@@ -149,7 +149,7 @@ class Table(BaseModel):
         )
 
     @classmethod
-    def rows(cls) -> Mapping[str, Row]:
+    def rows(cls) -> Mapping[str, ParameterRow]:
         """Return the parameter rows by name."""
         return _rows(cls)
 
@@ -245,8 +245,8 @@ def names_others(table: type[Table], values: Mapping[str, object]) -> bool:
 
 
 @cache
-def _rows(table: type[Table]) -> Mapping[str, Row]:
-    return {name: Row(name, info) for name, info in table.model_fields.items()}
+def _rows(table: type[Table]) -> Mapping[str, ParameterRow]:
+    return {name: ParameterRow(name, info) for name, info in table.model_fields.items()}
 
 
 class SharedParameters(Table):

@@ -18,7 +18,7 @@ import yaml
 from lathe_rc import allowed_code, files, resources
 from lathe_rc.cell import models, ros_yaml
 from lathe_rc.cell.kinds import STAGES
-from lathe_rc.cell.parameters import NodeParameters, Row, SharedParameters, Value, Values
+from lathe_rc.cell.parameters import NodeParameters, ParameterRow, SharedParameters, Value, Values
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.recorder import RecorderParameters
 from lathe_rc.cell.stage import Stage
@@ -216,7 +216,7 @@ class Scenario:
         """Whether the run ID is derived from the content instead of being set explicitly."""
         return self.shared.run_id == _identity(self.fingerprints)
 
-    def parameter(self, target: str) -> Row:
+    def parameter(self, target: str) -> ParameterRow:
         """Return the row of a parameter in its node's table.
 
         Args:

@@ -20,7 +20,7 @@ from lathe_rc.cell.time_master import START_FROM, TimeMaster
 from lathe_rc.errors import InputError, UnpublishedError
 
 if TYPE_CHECKING:
-    from lathe_machine.stages.learning.learner import Loop
+    from lathe_machine.stages.learning.learner import CheckedLoop
     from lathe_rc.analysis.cycle_factors import DriveMargin
     from lathe_rc.cell.checkpoint import Checkpoint
 
@@ -35,7 +35,7 @@ def _begun(nodes: Mapping[str, NodeParameters]) -> "Checkpoint | None":
 
 
 @dataclass(frozen=True)
-class Source:
+class Publisher:
     """Node that publishes a topic."""
 
     node: str
@@ -95,8 +95,8 @@ class Wiring:
         order: indices of the stages in order of computation.
     """
 
-    dense: dict[str, Source]
-    sparse: dict[str, Source]
+    dense: dict[str, Publisher]
+    sparse: dict[str, Publisher]
     order: Sequence[str]
 
 
@@ -116,25 +116,27 @@ def _wire(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> Wiring:
         raise InputError(f"{' -> '.join(error.args[1])}: a loop without a feedback delay cannot start") from None
 
 
-def _sources(stages: Sequence[Ports], unknown: Mapping[str, Unknown]) -> tuple[dict[str, Source], dict[str, Source]]:
+def _sources(
+    stages: Sequence[Ports], unknown: Mapping[str, Unknown]
+) -> tuple[dict[str, Publisher], dict[str, Publisher]]:
     """Return the publishers of dense and sparse topics."""
-    dense: dict[str, Source] = {}
-    sparse: dict[str, Source] = {}
+    dense: dict[str, Publisher] = {}
+    sparse: dict[str, Publisher] = {}
 
-    def add(topics: dict[str, Source], topic: str, source: Source) -> None:
+    def add(topics: dict[str, Publisher], topic: str, source: Publisher) -> None:
         if other := dense.get(topic) or sparse.get(topic):
             raise InputError(f"{topic} is published by {other.node} and {source.node}; remap one of them")
         topics[topic] = source
 
     for stage in stages:
         for topic, output in stage.outputs:
-            add(dense, topic, Source(stage.node, output.type))
+            add(dense, topic, Publisher(stage.node, output.type))
         for topic, msgtype in stage.sparse:
-            add(sparse, topic, Source(stage.node, msgtype))
+            add(sparse, topic, Publisher(stage.node, msgtype))
     for name, member in unknown.items():
         for topics, published in ((dense, member.dense), (sparse, member.sparse)):
             for topic, msgtype in published.items():
-                add(topics, topic, Source(name, msgtype))
+                add(topics, topic, Publisher(name, msgtype))
     return dense, sparse
 
 
@@ -144,7 +146,7 @@ def _wire_alike(stages: tuple[Ports, ...]) -> Wiring:
     return _wire(stages, {})
 
 
-def _source(dense: Mapping[str, Source], node: str, topic: str, port: Input) -> Source:
+def _source(dense: Mapping[str, Publisher], node: str, topic: str, port: Input) -> Publisher:
     """Return the publisher of a topic that a node reads."""
     source = dense.get(topic)
     if source is None:
@@ -196,7 +198,7 @@ class Cell:
     ) -> None:
         self.unknown, self.unchecked, self.warnings = unknown or {}, list[str](), list[str]()
         self.factors: dict[str, float] = {}
-        self.loops: dict[str, list[Loop]] = {}
+        self.loops: dict[str, list[CheckedLoop]] = {}
         self._tables = nodes
         self.begun: Checkpoint | None = _begun(nodes)
         new = self.begun.stage if self.begun else new_stage

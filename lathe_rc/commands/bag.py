@@ -16,7 +16,7 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check as check_bag
 from lathe_rc.bag.reading import stream
 from lathe_rc.bag.reading.limits import SIMULATED
-from lathe_rc.bag.reading.source import Source, files_of, name_of
+from lathe_rc.bag.reading.source import BagSource, files_of, name_of
 from lathe_rc.bag.repairing.recover import Choice
 from lathe_rc.bag.repairing.recover import copy as copy_chosen
 from lathe_rc.bag.repairing.recover import recover as recover_bag
@@ -63,13 +63,13 @@ def info(ctx: click.Context, path: Path, *, metrics: bool, whole: bool | None, a
 
     For a damaged bag, or one that lacks samples, show the readable content and what is wrong; exit code 3.
     """
-    with Source(path, partial=True) as source:
+    with BagSource(path, partial=True) as source:
         summary = _info(path, source, metrics=metrics)
         tables.show(summary, _told(source, summary, whole=whole), as_json=as_json)
         ctx.exit(_LOSSY if source.damage or summary["lost"] else 0)
 
 
-def _info(path: Path, source: Source, *, metrics: bool) -> dict[str, Any]:
+def _info(path: Path, source: BagSource, *, metrics: bool) -> dict[str, Any]:
     """Return what is shown of a bag; what cannot be read is added to the damage of its source."""
     span = (source.last_ns - source.first_ns) * 1e-9
     types = {topic: entry.type for topic, entry in source.topics.items()}
@@ -112,7 +112,7 @@ def _info(path: Path, source: Source, *, metrics: bool) -> dict[str, Any]:
     return summary
 
 
-def _told(source: Source, summary: Mapping[str, Any], *, whole: bool | None) -> Iterator[RenderableType]:
+def _told(source: BagSource, summary: Mapping[str, Any], *, whole: bool | None) -> Iterator[RenderableType]:
     yield tables.of_rows(
         summary["topics"].items(),
         {
@@ -254,7 +254,7 @@ def copy_bags(
     """
     first, known = list[int](), set[str]()
     for path in paths:
-        with Source(path, partial=True) as source:
+        with BagSource(path, partial=True) as source:
             first += [source.first_ns] if any(topic.count for topic in source.topics.values()) else []
             known |= source.topics.keys() | {each.topic for each in source.unread}
     for topic in (*topics, *without):

@@ -6,20 +6,20 @@ from pathlib import Path
 
 from lathe_rc import messages
 from lathe_rc.bag.reading.recorded import Recorded
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.blocks import columns
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples
 from lathe_rc.signals import measurement_source
-from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.measurement_file import MeasuredQuantities
 from lathe_rc.signals.measurement_source import Clock
 from lathe_rc.signals.quantities import Mapped
 
 _DRIVE = {"command": "coarse/command.position", "response": "coarse/state.measured_position"}
 
 
-class BagColumns(measurement_source.Source):
-    """Columns of a bag, for `lathe_rc.signals.measurement_file.Measurement`.
+class BagColumns(measurement_source.MeasurementSource):
+    """Columns of a bag, for `lathe_rc.signals.measurement_file.MeasuredQuantities`.
 
     Args:
         path: path of the bag.
@@ -34,7 +34,7 @@ class BagColumns(measurement_source.Source):
         self._path = path
         self.units: dict[str, str] = {}
         self._steps: dict[str, int] = {}
-        with Source(path) as source:
+        with BagSource(path) as source:
             self.namespace = Recorded(source, {}).namespace
             for topic, about in sorted(source.topics.items()):
                 if about.type in messages.block_types() and about.count:
@@ -50,7 +50,7 @@ class BagColumns(measurement_source.Source):
         Raises:
             LatheError: samples are missing or not finite.
         """
-        with Source(self._path) as source:
+        with BagSource(self._path) as source:
             places = [name.rpartition(".") for name in names]
             found = Recorded(source, {}).whole([(topic, field) for topic, _, field in places])
         return dict(zip(names, found, strict=True))
@@ -60,7 +60,7 @@ class BagColumns(measurement_source.Source):
         return Clock(0.0, self._steps[name.rpartition(".")[0]] * 1e-9)
 
 
-def measurement(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
+def measurement(path: Path, mapping: Mapping[str, Mapped]) -> MeasuredQuantities:
     """Open a bag as a measurement; without a mapping command and response are those of the coarse drive.
 
     A mapping of topics that have no blocks reads the messages of any type, resampled; with ``time=log`` by their log
@@ -76,7 +76,7 @@ def measurement(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
     if source.units and source.units.keys() >= set(asked) and not by_log:
         own = {quantity: Mapped(f"{source.namespace}/{column}") for quantity, column in _DRIVE.items()}
         own = {quantity: found for quantity, found in own.items() if found.column in source.units}
-        return Measurement(str(path), source, {**own, **mapping})
+        return MeasuredQuantities(str(path), source, {**own, **mapping})
 
     from lathe_rc.commands.message_columns import MessageColumns
 
@@ -85,4 +85,4 @@ def measurement(path: Path, mapping: Mapping[str, Mapped]) -> Measurement:
     if blocks and (by_log or others.units.keys() & set(asked)):
         raise InputError(f"{path}: {blocks[0]} is a signal of blocks; allowed: none beside messages or log times")
     others.units = source.units | others.units
-    return Measurement(str(path), others, wanted)
+    return MeasuredQuantities(str(path), others, wanted)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.errors import LossyRunError
 
 
@@ -14,7 +14,7 @@ def tell(bags: Iterable[Path]) -> bool:
     """Print the losses of members in the runs of bags on the error stream; return whether there are any."""
     found = False
     for path in bags:
-        with Source(path, partial=True) as source:
+        with BagSource(path, partial=True) as source:
             if loss := source.loss:
                 click.echo(f"{path}: {loss}", err=True)
                 found = True

@@ -8,7 +8,7 @@ import click
 
 from lathe_rc.commands import lossy, options
 from lathe_rc.signals import measurement_file
-from lathe_rc.signals.measurement_file import Measurement
+from lathe_rc.signals.measurement_file import MeasuredQuantities
 from lathe_rc.signals.quantities import parse_columns
 
 _BAGS = (".mcap", ".db3", ".zstd")
@@ -31,14 +31,14 @@ def is_bag(path: Path) -> bool:
 def tell_origin(path: Path) -> None:
     """Print to stderr of which bags a bag was made, if it was not recorded."""
     from lathe_rc.bag import provenance
-    from lathe_rc.bag.reading.source import Source
+    from lathe_rc.bag.reading.source import BagSource
 
-    with Source(path) as source:
+    with BagSource(path) as source:
         for what in provenance.origin(source.about):
             click.echo(f"lathe: warning: {path}: {what}", err=True)
 
 
-def opened(path: Path, given: Sequence[str]) -> Measurement:
+def opened(path: Path, given: Sequence[str]) -> MeasuredQuantities:
     """Open a file or a bag with the columns that the options name.
 
     Raises:

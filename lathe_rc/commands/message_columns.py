@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from lathe_rc import messages
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.blocks.columns import TEXT, flattened
 from lathe_rc.errors import InputError, LatheError, shown
 from lathe_rc.messages import Samples
@@ -35,7 +35,7 @@ class _Series(NamedTuple):
     clock: str
 
 
-class MessageColumns(measurement_source.Source):
+class MessageColumns(measurement_source.MeasurementSource):
     """Columns of messages; those that are asked for are resampled, linear between messages, which is said on stderr.
 
     Args:
@@ -51,7 +51,7 @@ class MessageColumns(measurement_source.Source):
 
     def __init__(self, path: Path, asked: Collection[str], *, by_log: bool = False) -> None:
         self.units: dict[str, str] = {}
-        with Source(path) as source:
+        with BagSource(path) as source:
             types = messages.store().fielddefs.keys() - messages.block_types()
             for topic, about in sorted(source.topics.items()):
                 if about.count and about.type in types:
@@ -89,7 +89,7 @@ def _numbers(message: Any) -> dict[str, float]:
     return found
 
 
-def _series(source: Source, column: str, *, by_log: bool) -> _Series:
+def _series(source: BagSource, column: str, *, by_log: bool) -> _Series:
     topic = max((topic for topic in source.topics if column.startswith(f"{topic}.")), key=len)
     msgtype, path = source.topics[topic].type, column.removeprefix(f"{topic}.")
     has_header = messages.fields(msgtype)[:1] == [("header", (Nodetype.NAME, "std_msgs/msg/Header"))]

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lathe_rc import harness
-from lathe_rc.analysis.budget import Budget, Part
+from lathe_rc.analysis.budget import Budget, Share
 from lathe_rc.analysis.metrology import Lay
 from lathe_rc.commands import plot, tables
 from lathe_rc.judge import part
@@ -90,10 +90,10 @@ def _margins(result: harness.Result) -> list[str]:
 
 def budget_told(found: Budget) -> Iterator[RenderableType]:
     """Yield an error budget, one row per cause."""
-    whole = Part(f"form error, {found.revolutions} revolutions", 1.0, found.rms, found.largest)
-    columns: dict[str, Callable[[Part], str]] = {
+    whole = Share(f"form error, {found.revolutions} revolutions", 1.0, found.rms, found.largest)
+    columns: dict[str, Callable[[Share], str]] = {
         "cause": lambda each: each.name,
-        "share of the power [%]": Part.percent,
+        "share of the power [%]": Share.percent,
         "RMS [µm]": lambda each: f"{each.rms * 1e6:.3g}",
         "maximum [µm]": lambda each: f"{each.largest * 1e6:.3g}",
     }

@@ -17,7 +17,7 @@ _LOG_PERIOD = 2.0  # [s] between lines without a terminal
 INTERRUPTED = 130  #: exit code of a command that Ctrl-C ends
 
 
-class Watch:
+class RunProgress:
     """Progress of a run on the error stream."""
 
     def __init__(self, console: Console) -> None:

@@ -10,7 +10,7 @@ from lathe_rc import harness
 from lathe_rc.cell.scenario import Scenario
 from lathe_rc.commands import outcome, picture, tables
 from lathe_rc.commands import scenario as scenarios
-from lathe_rc.commands.progress import Watch, watched_budget
+from lathe_rc.commands.progress import RunProgress, watched_budget
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.files import check_place
 from lathe_rc.judge import part
@@ -21,7 +21,7 @@ _NO_SNAPSHOTS = "no snapshots: no --bag was given"
 
 def watched(scenario: Scenario, **how: Any) -> harness.Result:
     """Run a scenario with a progress display; the keywords are those of `lathe_rc.harness.run`."""
-    with Watch(Console(stderr=True)) as watch:
+    with RunProgress(Console(stderr=True)) as watch:
         return harness.run(scenario, watch=watch, **how)
 
 

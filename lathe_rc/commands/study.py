@@ -13,14 +13,14 @@ from rich.progress import Progress
 
 from lathe_rc import allowed_code
 from lathe_rc.cell import ros_yaml
-from lathe_rc.cell.parameters import Row, Value
+from lathe_rc.cell.parameters import ParameterRow, Value
 from lathe_rc.commands import completers, options, picture, tables
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
-from lathe_rc.study import STUDIES, Result, Study, StudyParameters
+from lathe_rc.study import STUDIES, Study, StudyParameters, StudyResult
 
 
-def _value(row: Row, text: str) -> object:
+def _value(row: ParameterRow, text: str) -> object:
     """Parse a parameter's string, such as 1,2,3 for a list; a string parameter keeps the string unchanged."""
 
     def scalar(part: str) -> Value:
@@ -52,7 +52,7 @@ def read(study: Study[Any], overrides: Sequence[str]) -> StudyParameters:
     return table
 
 
-def _save(study: Study[Any], result: Result, path: Path) -> None:
+def _save(study: Study[Any], result: StudyResult, path: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=study.size, layout="constrained")

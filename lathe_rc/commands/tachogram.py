@@ -10,7 +10,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.bag.reading.recorded import Recorded
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.commands import measured
 from lathe_rc.errors import InputError
 from lathe_rc.messages import Samples
@@ -76,11 +76,11 @@ def make(bag: Path, output: Path, tolerance: float, topic: str = "", given: Sequ
         raise InputError(f"--topic {topic} beside --column; allowed: one of them")
     if given:
         return _written(bag, _of_column(bag, given), output, tolerance)
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         return _written(bag, _of_encoder(source, topic), output, tolerance)
 
 
-def _of_encoder(source: Source, topic: str) -> _Speed:
+def _of_encoder(source: BagSource, topic: str) -> _Speed:
     recorded = Recorded(source, {"encoder": _chosen(source, topic)})
     spindle = recorded.spindle("encoder")
     field = "speed_true" if spindle.has_truth else "speed"
@@ -125,7 +125,7 @@ def _written(bag: Path, recorded: _Speed, output: Path, tolerance: float) -> Mad
     return Made(time.size, recorded.samples, largest, recorded.field, still * recorded.step, stands_from)
 
 
-def _chosen(source: Source, topic: str) -> str:
+def _chosen(source: BagSource, topic: str) -> str:
     """Return the topic of the encoder."""
     found = sorted(t for t, said in source.topics.items() if said.type == messages.ENCODER and said.count)
     if topic and topic not in found:

@@ -20,7 +20,7 @@ MOST_ROWS = 200  #: largest number of rows of a table
 
 
 @dataclass(frozen=True)
-class Grid:
+class PageTable:
     """Table of a report; ``texts`` are the columns without numbers."""
 
     columns: Sequence[str]
@@ -46,7 +46,7 @@ def shown(value: float) -> str:
 
 def grid(
     columns: Sequence[str], rows: Iterable[Sequence[object]], texts: Sequence[str] = (), count: int = 0
-) -> Grid | None:
+) -> PageTable | None:
     """Return a table of the first rows and the number of omitted rows out of ``count``; None without rows."""
     cells = [
         [shown(cell) if isinstance(cell, float) else printable(str(cell)) for cell in row]
@@ -54,7 +54,7 @@ def grid(
     ]
     if count > len(cells):
         cells.append([f"… and {count - len(cells)} more"])
-    return Grid(columns, cells, texts) if cells else None
+    return PageTable(columns, cells, texts) if cells else None
 
 
 def check_page(page: Path, option: str = "-o") -> None:

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 from lathe_rc import messages
-from lathe_rc.analysis.loop_errors import LoopErrors, RunningLoop, Step
+from lathe_rc.analysis.loop_errors import LoopErrors, RunningLoop, SetPointStep
 from lathe_rc.analysis.tolerance import FORCE, LAST, POSITION, Growth, Quantity, Verdict, judge, swing_growth
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.judged import Judged
@@ -26,7 +26,7 @@ _FAILURES = {
 
 
 @dataclass(frozen=True)
-class Loop:
+class ServoLoop:
     """Force or position loop of a cell.
 
     Attributes:
@@ -60,10 +60,10 @@ class Loop:
 _QUANTITIES = {"force": FORCE, "position": POSITION}
 
 
-def loops(declared: Mapping[str, Judged]) -> list[Loop]:
+def loops(declared: Mapping[str, Judged]) -> list[ServoLoop]:
     """Return the force and position loops among what nodes declare that a run is judged by."""
     return [
-        Loop(node, each.topic, _QUANTITIES[each.quantity], each.delay, each.limit, each.tolerance, each.step)
+        ServoLoop(node, each.topic, _QUANTITIES[each.quantity], each.delay, each.limit, each.tolerance, each.step)
         for node, each in declared.items()
         if each.quantity in _QUANTITIES
     ]
@@ -80,7 +80,7 @@ class LoopResult:
         why: reason why the loop was not evaluated to the end of the run; empty if it was.
     """
 
-    loop: Loop
+    loop: ServoLoop
     found: LoopErrors
     before: int = 0
     why: str = ""
@@ -203,7 +203,7 @@ class LoopResult:
         }
 
 
-def _step(of: Callable[[Step, float], float | None]) -> Callable[[LoopResult], float | None]:
+def _step(of: Callable[[SetPointStep, float], float | None]) -> Callable[[LoopResult], float | None]:
     return lambda result: of(result.found.step, result.loop.step) if result.found.step else None
 
 
@@ -236,7 +236,7 @@ class LoopWatch:
         topics: topics that the sink reads.
     """
 
-    def __init__(self, loop: Loop, encoder: str, topic: str, measured: Collection[str] = ()) -> None:
+    def __init__(self, loop: ServoLoop, encoder: str, topic: str, measured: Collection[str] = ()) -> None:
         self.loop, self.topics = loop, (encoder, topic)
         self._soundness = Soundness({*measured, *(f"{full(topic)}.{field}" for field in ("set_point", "error"))})
         self._before = 0
@@ -259,7 +259,7 @@ class LoopWatch:
         return LoopResult(self.loop, running.found(), self._before, self._soundness.why)
 
 
-def watches(found: Sequence[Loop], types: Mapping[str, str]) -> list[LoopWatch]:
+def watches(found: Sequence[ServoLoop], types: Mapping[str, str]) -> list[LoopWatch]:
     """Return a sink for each loop whose messages are among topics with these message types, together with an angle."""
     encoder = next((topic for topic, kind in types.items() if kind == messages.ENCODER), None)
     named = ((loop, next((topic for topic in types if full(topic).endswith(f"/{loop.topic}")), None)) for loop in found)
@@ -279,7 +279,7 @@ def watches(found: Sequence[Loop], types: Mapping[str, str]) -> list[LoopWatch]:
     ]
 
 
-def evaluated(found: list[Loop], recording: Recording) -> dict[str, LoopResult]:
+def evaluated(found: list[ServoLoop], recording: Recording) -> dict[str, LoopResult]:
     """Return the results of loops whose messages a recording contains, by controller."""
     made = watches(found, {topic: recording.types[topic] for topic in recording.dense})
     for start in range(0, recording.samples if made else 0, _PIECE):

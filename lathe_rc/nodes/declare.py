@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from lathe_rc.cell import ros_yaml
-from lathe_rc.cell.parameters import Row, SharedParameters, Table, Value
+from lathe_rc.cell.parameters import ParameterRow, SharedParameters, Table, Value
 from lathe_rc.errors import InputError
 from lathe_rc.names import instead
 from lathe_rc.nodes import arguments
@@ -33,7 +33,7 @@ _TYPES = {
 }
 
 
-def descriptor(row: Row) -> ParameterDescriptor:
+def descriptor(row: ParameterRow) -> ParameterDescriptor:
     """Return the ROS descriptor of a parameter; read-only, unless `release` says otherwise."""
     made = ParameterDescriptor(
         name=row.name,

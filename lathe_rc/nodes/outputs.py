@@ -14,7 +14,7 @@ from lathe_rc.extensions import is_ours
 from lathe_rc.messages import Samples, Signals
 from lathe_rc.nodes.cell_node import CellNode
 from lathe_rc.nodes.ports import message_class, signal_qos
-from lathe_rc.protocol.exchange import Run
+from lathe_rc.protocol.exchange import JoinedBlocks
 
 _OUTSIDE_PERIOD = 0.02  # [s] between checks for readers in other processes
 
@@ -113,7 +113,7 @@ class Outputs:
                 block.check()
             except ValueError as error:
                 raise LatheError(f"{topic}: {error}") from None
-            run = Run(block, companions)
+            run = JoinedBlocks(block, companions)
             if self._goes_out(topic):
                 for each in run.blocks(self._size):
                     start, end, count = each.first_index, each.last, each.companions

@@ -18,7 +18,7 @@ from lathe_rc.bag.snapshot import GONE_ON, SNAPSHOTS_GONE_ON, Snapshot
 from lathe_rc.bag.writing.order import Merger
 from lathe_rc.bag.writing.record import bag_of, split
 from lathe_rc.bag.writing.snapshots import Snapshots
-from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Durability, Output, offered_qos
+from lathe_rc.bag.writing.writer import FLUSH_PERIOD, Durability, MessageSink, offered_qos
 from lathe_rc.blocks.block import Block
 from lathe_rc.blocks.ports import signal_depth
 from lathe_rc.blocks.wire import Decoder, Encoder
@@ -32,7 +32,7 @@ from lathe_rc.nodes.cell_node import CellNode, Role
 from lathe_rc.nodes.ports import latched_qos, message_class
 from lathe_rc.protocol import Announcement, ForeignMessage, MemberProtocol
 from lathe_rc.protocol.block_queue import BlockQueue, explain_losses
-from lathe_rc.protocol.exchange import Run
+from lathe_rc.protocol.exchange import JoinedBlocks
 from lathe_rc.protocol.messages import check_sender
 
 _HOST_TOPICS = {"/diagnostics": QoSProfile(depth=100), "cell_state": latched_qos(4)}
@@ -60,7 +60,7 @@ class RecorderRole(Role):
             self._snapshots = Snapshots(
                 place, self.table, name=node.get_name(), namespace=namespace, told=self._tell_snapshot
             )
-        self._writer: Output | None = bag_of(self._path, self.table, self._snapshots)
+        self._writer: MessageSink | None = bag_of(self._path, self.table, self._snapshots)
         self._depth = signal_depth(self.table.window)
         self._queues: dict[str, BlockQueue] = {}
         self._sparse: dict[str, str] = {}  # topic -> source
@@ -121,7 +121,7 @@ class RecorderRole(Role):
             self.node.get_logger().info(f"bag {self._path} removed: no block has come")
 
     @property
-    def _open(self) -> Output:
+    def _open(self) -> MessageSink:
         assert self._writer is not None, "the bag is closed"
         return self._writer
 
@@ -364,7 +364,7 @@ class RecorderRole(Role):
         else:
             self._merger.add_block(queue.topic, block, data)
 
-    def _on_run(self, queue: BlockQueue, run: Run) -> None:
+    def _on_run(self, queue: BlockQueue, run: JoinedBlocks) -> None:
         """Record blocks from a node in this process; their messages at chosen samples have arrived before."""
         if self.node.protocol.over:
             return

@@ -15,7 +15,7 @@ from lathe_rc.blocks.wire import Decoder, NoBlockError
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import Signals
 from lathe_rc.protocol.block_order import BlockOrder
-from lathe_rc.protocol.exchange import Run
+from lathe_rc.protocol.exchange import JoinedBlocks
 from lathe_rc.protocol.messages import ForeignMessage
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ class BlockQueue(BlockOrder):
             raise self.reject(self.source, str(error)) from None
         return self._queue(block)
 
-    def take(self, run: Run) -> None:
+    def take(self, run: JoinedBlocks) -> None:
         """Queue blocks that a node of this process has handed over, which has checked their numbers.
 
         Raises:

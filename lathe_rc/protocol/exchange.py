@@ -4,7 +4,7 @@
 The topics inside the process are fixed once, after the nodes of the process have been configured and before any is
 activated. Nodes configured later, and nodes in other processes, use DDS. The exchange passes on the publisher's arrays
 themselves, which are not modified afterwards, or the bytes of a message at a chosen sample. Blocks computed in one step
-are passed on as one `Run`.
+are passed on as one `JoinedBlocks`.
 """
 
 from collections import defaultdict
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from lathe_rc.cell.wiring import Cell
 
 
-class Run(NamedTuple):
+class JoinedBlocks(NamedTuple):
     """Consecutive blocks, joined into one.
 
     Attributes:
@@ -39,7 +39,7 @@ class Run(NamedTuple):
             yield block
 
 
-Delivery = Run | bytes  #: blocks, or an encoded message at a chosen sample
+Delivery = JoinedBlocks | bytes  #: blocks, or an encoded message at a chosen sample
 
 
 class Exchange:
@@ -60,7 +60,7 @@ class Exchange:
         self.waited = 0.0
         self._inside: set[str] = set()
         self._readers: dict[str, dict[str, Callable[[Any], None]]] = defaultdict(dict)
-        self._newest: dict[str, Run] = {}  # by topic
+        self._newest: dict[str, JoinedBlocks] = {}  # by topic
 
     def join(self, published: Iterable[str]) -> None:
         """Register the topics that a configured node publishes, by fully qualified name."""
@@ -89,7 +89,7 @@ class Exchange:
 
     def hand_over(self, topic: str, delivery: Delivery) -> None:
         """Pass a message on to the readers in this process."""
-        if isinstance(delivery, Run):
+        if isinstance(delivery, JoinedBlocks):
             self._newest[topic] = delivery
         for callback in self._readers.get(topic, {}).values():
             callback(delivery)

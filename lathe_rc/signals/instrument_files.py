@@ -12,11 +12,11 @@ import scipy
 from lathe_rc import extras
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError
-from lathe_rc.signals.measurement_source import Clock, Source, even_clock
+from lathe_rc.signals.measurement_source import Clock, MeasurementSource, even_clock
 from lathe_rc.signals.quantities import factor, rank, unit_of
 
 
-class _Parquet(Source):
+class _Parquet(MeasurementSource):
     """Parquet file; the metadata ``unit`` of a field is the unit of the column."""
 
     def __init__(self, path: Path) -> None:
@@ -31,7 +31,7 @@ class _Parquet(Source):
         return {name: table.column(name).to_numpy() for name in names}
 
 
-class _Mat(Source):
+class _Mat(MeasurementSource):
     """MATLAB file; a field of a structure is ``NAME.FIELD``; a field ``time`` states the sampling of its structure."""
 
     def __init__(self, path: Path) -> None:
@@ -79,7 +79,7 @@ def _since(start: Any, seconds: int) -> float:
     return float(start.seconds - seconds + start.second_fractions / 2**64) if start else float(-seconds)
 
 
-class _Tdms(Source):
+class _Tdms(MeasurementSource):
     """TDMS file: ``CHANNEL``, or ``GROUP/CHANNEL`` where the name of the channel alone is not unique."""
 
     def __init__(self, path: Path) -> None:
@@ -120,7 +120,7 @@ class _Tdms(Source):
         return self._clocks.get(name)
 
 
-class _Mdf(Source):
+class _Mdf(MeasurementSource):
     """MDF file (versions 2 to 4): channels by name, the first of each."""
 
     def __init__(self, path: Path) -> None:
@@ -148,4 +148,9 @@ class _Mdf(Source):
 
 
 #: Readers by the name of their format.
-FORMATS: Mapping[str, Callable[[Path], Source]] = {"Parquet": _Parquet, "MATLAB": _Mat, "TDMS": _Tdms, "MDF": _Mdf}
+FORMATS: Mapping[str, Callable[[Path], MeasurementSource]] = {
+    "Parquet": _Parquet,
+    "MATLAB": _Mat,
+    "TDMS": _Tdms,
+    "MDF": _Mdf,
+}

@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from lathe_rc.arrays import Array
 from lathe_rc.errors import InputError, LatheError, shown
-from lathe_rc.signals.measurement_source import Clock, Source, even_clock
+from lathe_rc.signals.measurement_source import Clock, MeasurementSource, even_clock
 from lathe_rc.signals.quantities import UNITS, Mapped, factor, is_decibel, is_quantity, rank, unit_of
-from lathe_rc.signals.table import Table
+from lathe_rc.signals.table import TextTable
 
 _SAME_START = 1e-8  # [s] two columns that begin within it begin together
 _MOST_COLUMNS = 12  # that an error message lists
@@ -66,7 +66,7 @@ def check_rising(time: Array, path: Path) -> None:
         )
 
 
-class Measurement:
+class MeasuredQuantities:
     """Quantities of a measurement, in SI units.
 
     Args:
@@ -78,7 +78,7 @@ class Measurement:
         InputError: a column of the mapping does not exist.
     """
 
-    def __init__(self, name: str, source: Source, mapping: Mapping[str, Mapped] | None) -> None:
+    def __init__(self, name: str, source: MeasurementSource, mapping: Mapping[str, Mapped] | None) -> None:
         self.name, self._source, self._has_option, mapping = name, source, mapping is not None, mapping or {}
         self._columns: dict[str, Mapped] = {}
         self._doubles: dict[str, list[str]] = {}  # columns that are named by the same quantity
@@ -241,11 +241,11 @@ class Measurement:
         return stated[0][1]
 
 
-class _Text(Source):
+class _Text(MeasurementSource):
     """Text table (see `lathe_rc.signals.table`)."""
 
     def __init__(self, path: Path, known: Collection[str]) -> None:
-        self._table = Table(path, lambda column: column in known or is_quantity(column))
+        self._table = TextTable(path, lambda column: column in known or is_quantity(column))
         names = self._table.names
         self.units = dict.fromkeys(names, "") | dict(zip(names, self._table.units, strict=False))
 
@@ -267,11 +267,11 @@ _INSTRUMENTS = {
 }
 
 
-def read(path: Path, mapping: Mapping[str, Mapped] | None = None) -> Measurement:
+def read(path: Path, mapping: Mapping[str, Mapped] | None = None) -> MeasuredQuantities:
     """Open a measurement file with a mapping of its columns; a file of another ending is a text table.
 
     Raises:
-        InputError: the file is missing or damaged, or see `Measurement`.
+        InputError: the file is missing or damaged, or see `MeasuredQuantities`.
         LatheError: the package that reads the format is not installed.
     """
     if not path.is_file():
@@ -280,7 +280,9 @@ def read(path: Path, mapping: Mapping[str, Mapped] | None = None) -> Measurement
     name = _INSTRUMENTS.get(path.suffix.lower())
     with _readable(f"{path}: no readable {name or 'CSV'} file"):
         if name is None:
-            return Measurement(str(path), _Text(path, {column for column, _ in (mapping or {}).values()}), mapping)
+            return MeasuredQuantities(
+                str(path), _Text(path, {column for column, _ in (mapping or {}).values()}), mapping
+            )
         from lathe_rc.signals import instrument_files  # with SciPy, which text does not need
 
-        return Measurement(str(path), instrument_files.FORMATS[name](path), mapping)
+        return MeasuredQuantities(str(path), instrument_files.FORMATS[name](path), mapping)

@@ -19,7 +19,7 @@ class Clock(NamedTuple):
     step: float
 
 
-class Source(ABC):
+class MeasurementSource(ABC):
     """Opened measurement: columns by name.
 
     Attributes:

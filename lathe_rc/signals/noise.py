@@ -21,7 +21,7 @@ def quantise(value: float, resolution: float) -> float:
     return value
 
 
-class Drawn(NamedTuple):
+class DrawnNumbers(NamedTuple):
     """Normal random numbers with mean 0 and RMS 1, for kernels.
 
     Attributes:
@@ -50,7 +50,7 @@ class NormalStream:
         if on:
             self.generator = np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(name.encode())]))
         size = DRAWN if on else 0
-        self.drawn = Drawn(np.zeros(size), np.array([size], np.int64))
+        self.drawn = DrawnNumbers(np.zeros(size), np.array([size], np.int64))
 
     def draw(self, numbers: int) -> None:
         """Ensure that ``numbers`` random numbers are drawn in advance, up to 8192."""
@@ -91,7 +91,7 @@ class SensorTable(NamedTuple):
         resolution: quantisation step, in the unit of the signal.
     """
 
-    noise: Drawn
+    noise: DrawnNumbers
     rms: float
     resolution: float
 

@@ -117,7 +117,7 @@ def read_text(path: Path) -> str:
         raise _not_text(path) from None
 
 
-class Table:
+class TextTable:
     """Text table, read row by row.
 
     Args:
@@ -308,7 +308,7 @@ class Table:
 
 
 def write_table(path: Path, header: str, rows: Array, comment: str = "", *, digits: int = 15) -> None:
-    """Write a CSV file atomically, which `Table` reads.
+    """Write a CSV file atomically, which `TextTable` reads.
 
     Args:
         path: path of the file; an existing file is replaced.

@@ -10,13 +10,13 @@ import numpy as np
 
 from lathe_rc import __version__
 from lathe_rc.drawing.charts import Charts, page_template
-from lathe_rc.drawing.pages import Grid, check_page, grid, printable, write_page
+from lathe_rc.drawing.pages import PageTable, check_page, grid, printable, write_page
 from lathe_rc.errors import InputError
 from lathe_rc.judge.loops import FIGURES
 from lathe_rc.view import compare_figures as figures
 from lathe_rc.view import report_figures
 from lathe_rc.view.report import SIGNALS, losses
-from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_form import FormByRevolution
 from lathe_rc.view.report_gather import Gathered, gather
 from lathe_rc.view.report_servo import Servo
 from lathe_rc.view.report_verdict import assess
@@ -33,12 +33,12 @@ _SERVO_FIGURES = {
 }
 
 
-def _forms(runs: Mapping[str, Gathered]) -> dict[str, Form]:
+def _forms(runs: Mapping[str, Gathered]) -> dict[str, FormByRevolution]:
     """Return the form of the first tool of each run that has complete revolutions."""
     return {name: data.forms[0] for name, data in runs.items() if data.forms and data.forms[0].last}
 
 
-def _results(runs: Mapping[str, Gathered], forms: Mapping[str, Form]) -> Grid | None:
+def _results(runs: Mapping[str, Gathered], forms: Mapping[str, FormByRevolution]) -> PageTable | None:
     rows = []
     for name, data in runs.items():
         found = assess(data, losses(data), None)
@@ -73,7 +73,7 @@ def _servos(runs: Mapping[str, Gathered]) -> Servos:
     return {node: servos for node, servos in found.items() if servos}
 
 
-def _servo_results(servos: Servos) -> Grid | None:
+def _servo_results(servos: Servos) -> PageTable | None:
     rows = []
     for node, by_run in servos.items():
         for name, servo in by_run.items():
@@ -105,7 +105,7 @@ def _servo_figures(
         yield {"node": node, "loop": loop, "run": name, **{each: charts.place([spec]) for each, spec in drawn.items()}}
 
 
-def _parameters(runs: Mapping[str, Gathered]) -> tuple[Grid | None, Grid | None]:
+def _parameters(runs: Mapping[str, Gathered]) -> tuple[PageTable | None, PageTable | None]:
     """Return the parameters that differ, as the scenarios of the bags give them: of nodes of all runs, of some only."""
     scenarios = [data.nodes for data in runs.values()]
     names = {(node, name) for nodes in scenarios for node, values in nodes.items() for name in values}

@@ -15,7 +15,7 @@ from lathe_rc.drawing.charts import Rows, Spec, axis_scale, chart, number, quant
 from lathe_rc.judge.loops import LoopResult
 from lathe_rc.messages import Samples
 from lathe_rc.view.report_figures import LEGEND, colour_range, diverging, rectangles, um
-from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_form import FormByRevolution
 from lathe_rc.view.report_series import Envelope
 
 MAPS, SPECTRA, SIZES = "maps", "spectra", "sizes"  #: names of the data sets
@@ -69,7 +69,7 @@ class Compared:
         return {**plain, SIZES: sizes}
 
 
-def compared(forms: Mapping[str, Form], tolerance: float, unjudged: Collection[str] = ()) -> Compared:
+def compared(forms: Mapping[str, FormByRevolution], tolerance: float, unjudged: Collection[str] = ()) -> Compared:
     """Return the maps of several runs with common rows.
 
     Args:
@@ -95,7 +95,7 @@ def compared(forms: Mapping[str, Form], tolerance: float, unjudged: Collection[s
     return Compared(maps, differences, step, longest, shown, sizes, doubts, first_shown, unjudged)
 
 
-def _rows(form: Form, step: int, count: int) -> Samples:
+def _rows(form: FormByRevolution, step: int, count: int) -> Samples:
     """Return the map of a run in µm with ``step`` revolutions a row."""
     fields = um(form.map.rows())
     fields = fields.reshape(len(fields), _ACROSS, -1).mean(axis=-1)

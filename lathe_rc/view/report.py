@@ -19,14 +19,14 @@ from lathe_rc.bag.provenance import FILE, ORIGINS, SCENARIO, VERSIONS, origin, o
 from lathe_rc.bag.reading.source import name_of
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.drawing.charts import Charts, page_template
-from lathe_rc.drawing.pages import MOST_ROWS, Grid, check_page, grid, printable, shown, write_page
+from lathe_rc.drawing.pages import MOST_ROWS, PageTable, check_page, grid, printable, shown, write_page
 from lathe_rc.errors import LatheError
 from lathe_rc.judge.budget import budget
 from lathe_rc.judge.loop_curves import LoopCurve, loop_curves
 from lathe_rc.judge.part import along_in_words
 from lathe_rc.view import report_figures as figures
 from lathe_rc.view import report_loop
-from lathe_rc.view.report_form import CUTOFF, Form
+from lathe_rc.view.report_form import CUTOFF, FormByRevolution
 from lathe_rc.view.report_gather import Gathered, gather
 from lathe_rc.view.report_series import Envelope
 from lathe_rc.view.report_verdict import assess
@@ -41,7 +41,7 @@ SIGNALS = (
 )
 
 
-def _metrics(form: Form) -> Grid | None:
+def _metrics(form: FormByRevolution) -> PageTable | None:
     rows = []
     for name, revolution in figures.shown_revolutions(form):
         numbers = revolution.numbers
@@ -52,7 +52,7 @@ def _metrics(form: Form) -> Grid | None:
     return grid(columns, rows, ("",))
 
 
-def _form(form: Form, cycles: Mapping[str, Envelope], maps: int, charts: Charts) -> dict[str, Any]:
+def _form(form: FormByRevolution, cycles: Mapping[str, Envelope], maps: int, charts: Charts) -> dict[str, Any]:
     """Return the section of a tool; ``maps``: number of maps in the page."""
     if form.first is None:
         return {"form": form, "refused": form.refused or "the bag holds no complete revolution", "metrics": None}
@@ -113,7 +113,7 @@ def _servos(data: Gathered, charts: Charts) -> Iterator[dict[str, Any]]:
         }
 
 
-def _nodes(data: Gathered) -> Grid | None:
+def _nodes(data: Gathered) -> PageTable | None:
     levels = ("ok", "warning", "error", "stale")
     rows = (
         [
@@ -150,7 +150,7 @@ def losses(data: Gathered) -> list[str]:
     return [printable(text) for text in found]
 
 
-def _topics(data: Gathered) -> Grid | None:
+def _topics(data: Gathered) -> PageTable | None:
     dense = messages.block_types()
     rows = (
         [
@@ -171,13 +171,13 @@ def _topics(data: Gathered) -> Grid | None:
     return grid(columns, rows, ("topic", "type"), len(data.topics))
 
 
-def _events(data: Gathered) -> Grid | None:
+def _events(data: Gathered) -> PageTable | None:
     rows = ([each.topic, each.sample, each.sample * data.step_ns * 1e-9, each.text] for each in data.curves.events)
     columns = ("topic", "sample", "time [s]", "action")
     return grid(columns, rows, ("topic", "action"), data.curves.event_count)
 
 
-def _versions(data: Gathered) -> Grid | None:
+def _versions(data: Gathered) -> PageTable | None:
     try:
         given = json.loads(data.about.get(VERSIONS, ""))
     except (ValueError, RecursionError):
@@ -187,14 +187,14 @@ def _versions(data: Gathered) -> Grid | None:
     return grid(columns, rows, columns, len(rows))
 
 
-def _origins(data: Gathered) -> Grid | None:
+def _origins(data: Gathered) -> PageTable | None:
     found = origins(data.about)
     rows = ([origin.name, origin.package or "–", ", ".join(origin.used), origin.source] for origin in found)
     columns = ("class of others", "of", "used by", "source")
     return grid(columns, rows, columns, len(found))
 
 
-def _about(data: Gathered) -> Grid | None:
+def _about(data: Gathered) -> PageTable | None:
     rows = [
         (key, f"{len(text)} characters of base64" if key.startswith(FILE) else text)
         for key, text in sorted(data.about.items())
@@ -203,7 +203,7 @@ def _about(data: Gathered) -> Grid | None:
     return grid(("key", "text"), rows, ("key", "text"), len(rows))
 
 
-def _budget(found: Budget) -> Grid | None:
+def _budget(found: Budget) -> PageTable | None:
     rows = [[part.name, part.percent(), part.rms * 1e6, part.largest * 1e6] for part in found.rows]
     rows.append(["form error", "100.0", found.rms * 1e6, found.largest * 1e6])
     return grid(("cause", "share [%]", "RMS [µm]", "max [µm]"), rows, ("cause",))

@@ -10,7 +10,7 @@ from lathe_rc.analysis.metrology import Lay
 from lathe_rc.drawing.charts import Rows, Spec, axis_scale, chart, number, quantity, rows, tip
 from lathe_rc.judge.loops import LoopResult
 from lathe_rc.messages import Samples
-from lathe_rc.view.report_form import Form, Revolution
+from lathe_rc.view.report_form import FormByRevolution, Revolution
 from lathe_rc.view.report_gather import Gathered
 from lathe_rc.view.report_host import Host
 from lathe_rc.view.report_series import Envelope
@@ -144,7 +144,7 @@ def diverging(title: str, largest: float, linear: float) -> Spec:
     return quantity("data", title, scale=scale, legend={**_GRADIENT, "values": values, "format": ".3~g"})
 
 
-def form_map(form: Form, maps: int) -> Spec:
+def form_map(form: FormByRevolution, maps: int) -> Spec:
     """Return a map of the radius deviation by revolution and angle; ``maps``: number of maps in the page."""
     fields = um(form.map.rows())
     largest, linear = colour_range(fields)
@@ -184,7 +184,7 @@ def along(surface: Lay) -> list[Spec]:
 # --- revolutions
 
 
-def polar(form: Form) -> list[Spec]:
+def polar(form: FormByRevolution) -> list[Spec]:
     """Return polar plots of the radius deviation of the first and the last revolution, each with its own scale."""
     return [_polar(each, colour) for each, colour in ((form.first, FIRST), (form.last, LAST)) if each]
 
@@ -248,7 +248,7 @@ def _polar(revolution: Revolution, colour: int) -> Spec:
     )
 
 
-def shown_revolutions(form: Form) -> list[tuple[str, Revolution]]:
+def shown_revolutions(form: FormByRevolution) -> list[tuple[str, Revolution]]:
     """Return the first, best and last revolution with their labels, without repetitions."""
     shown: dict[int, tuple[str, Revolution]] = {}
     for name, revolution in (("first", form.first), ("best", form.best), ("last", form.last)):
@@ -258,14 +258,14 @@ def shown_revolutions(form: Form) -> list[tuple[str, Revolution]]:
     return list(shown.values())
 
 
-def spectrum_range(form: Form) -> tuple[float, float]:
+def spectrum_range(form: FormByRevolution) -> tuple[float, float]:
     """Return a range of amplitudes [µm] with three decades for each shown revolution; (0, 0) without amplitudes."""
     tops = [float(um(revolution.amplitude[1:]).max()) for _, revolution in shown_revolutions(form)]
     tops = [top for top in tops if top > 0.0]
     return (min(min(tops) * 1e-3, max(tops) * 1e-6), max(tops) * 2.0) if tops else (0.0, 0.0)
 
 
-def spectrum(form: Form) -> Spec:
+def spectrum(form: FormByRevolution) -> Spec:
     """Return a bar chart of the amplitude by undulations per revolution."""
     places = {"first": FIRST, "best": _BEST, "last": LAST}
     shown = {f"{name} revolution ({each.numbers['revolution']})": each for name, each in shown_revolutions(form)}
@@ -377,7 +377,7 @@ def limit_line(value: float, text: str, dy: int = -6) -> Rows:
     ]
 
 
-def convergence(form: Form | None, cycles: Mapping[str, Envelope]) -> Spec:
+def convergence(form: FormByRevolution | None, cycles: Mapping[str, Envelope]) -> Spec:
     """Return a plot of the form error by revolution, and of the controllers' named cycle reports [m]."""
     own = {"form error, RMS": (form.rms, LAST), "form error, largest": (form.largest, _GREY)} if form else {}
     drawn = {label: (series, colour, False) for label, (series, colour) in own.items() if series.size}

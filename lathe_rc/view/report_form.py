@@ -44,7 +44,7 @@ class Revolution:
     amplitude: Samples
 
 
-class Form:
+class FormByRevolution:
     """Form error of one tool by revolution; a sink (see `lathe_rc.cell.engine.Sink`).
 
     Args:

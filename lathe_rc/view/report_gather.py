@@ -12,7 +12,7 @@ import numpy as np
 
 from lathe_rc import event_log, messages
 from lathe_rc.bag import provenance
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.reading.stream import Feeder, first_of
 from lathe_rc.bag.snapshot import span_of
@@ -25,7 +25,7 @@ from lathe_rc.event_log import LOGGED, LogEntry
 from lathe_rc.judge import part
 from lathe_rc.judge.loops import loops, watches
 from lathe_rc.messages import Samples, Signals
-from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_form import FormByRevolution
 from lathe_rc.view.report_host import TYPES as HOST_TYPES
 from lathe_rc.view.report_host import Host
 from lathe_rc.view.report_series import Envelope
@@ -154,7 +154,7 @@ class Gathered:
 
     about: Mapping[str, str]
     topics: dict[str, Tally]
-    forms: list[Form]
+    forms: list[FormByRevolution]
     curves: Curves
     servos: list[Servo] = field(default_factory=list)
     host: Host = field(default_factory=Host)
@@ -213,7 +213,7 @@ def gather(path: Path) -> Gathered:
     Raises:
         InputError: not a bag.
     """
-    with Source(path) as source:
+    with BagSource(path) as source:
         types = {topic: found.type for topic, found in source.topics.items()}
         nodes, declared, unjudged = {}, dict[str, Judged](), ""
         try:
@@ -223,7 +223,7 @@ def gather(path: Path) -> Gathered:
             unjudged = str(error)
         nose, doubt = part.nose_radius(declared), provenance.doubt_of(source.about)
         forms = [
-            Form(encoder, tool, part.Tolerances.of(declared, tool, doubt), nose, types)
+            FormByRevolution(encoder, tool, part.Tolerances.of(declared, tool, doubt), nose, types)
             for encoder in of_type(types, messages.ENCODER)[:1]
             for tool in of_type(types, messages.TOOL)
         ]
@@ -242,7 +242,7 @@ def gather(path: Path) -> Gathered:
     return gathered
 
 
-def _feed(source: Source, feeder: Feeder, gathered: Gathered) -> None:
+def _feed(source: BagSource, feeder: Feeder, gathered: Gathered) -> None:
     """Count every message, and pass it to the feeder or to the host data."""
     newest: dict[str, bytes] = {}
     host = {topic for topic, tally in gathered.topics.items() if tally.type in HOST_TYPES}

@@ -16,7 +16,7 @@ from lathe_rc.cell.events import LIMITED, parse
 from lathe_rc.judge.causes import changing
 from lathe_rc.view.form_limits import WARN, Finding, form_limits, varying_speed
 from lathe_rc.view.report_figures import um
-from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_form import FormByRevolution
 from lathe_rc.view.report_gather import EventKind, Gathered
 
 GOOD, BAD = "good", "bad"
@@ -76,7 +76,7 @@ def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _verdict(data: Gathered, form: Form | None) -> Finding:
+def _verdict(data: Gathered, form: FormByRevolution | None) -> Finding:
     if form is None:
         return Finding(f"No form to judge: {data.missing}.")
     if form.refused or form.last is None:
@@ -117,7 +117,7 @@ def _incidents(data: Gathered) -> Iterator[str]:
         yield f"{len(kinds) - _MOST} further kinds of faults and alarms, see the events"
 
 
-def _form(data: Gathered, form: Form) -> Iterator[Finding]:
+def _form(data: Gathered, form: FormByRevolution) -> Iterator[Finding]:
     """Yield findings on the final form error and on its repeatable and variable parts."""
     speeds = (series.extremes for (_, name), series in data.curves.signals.items() if name == "speed_true")
     yield from form_limits(

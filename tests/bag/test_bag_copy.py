@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin
 import lathe_rc
 from lathe_rc import harness
 from lathe_rc.bag.check import check
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.writing.writer import BagWriter
 
 
@@ -81,7 +81,7 @@ def test_a_recording_that_joined_late_or_lacks_samples_is_described(turned, tmp_
 def test_a_cell_recorded_at_the_wall_time_is_clean(turned, tmp_path):
     """The log times of its blocks are not their stamps."""
     made = BagWriter(tmp_path / "wall", compression="none", chunk_size=2**20, about={})
-    with Source(turned) as source:
+    with BagSource(turned) as source:
         for topic, each in source.topics.items():
             made.add_topic(topic, each.type, each.qos[0])
         for topic, log_ns, data in source.messages():

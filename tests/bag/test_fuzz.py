@@ -24,7 +24,7 @@ from lathe_rc.bag import provenance
 from lathe_rc.bag.check import check
 from lathe_rc.bag.reading import metadata
 from lathe_rc.bag.reading.limits import MOST_BYTES
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.reading.stream import Feeder
 from lathe_rc.bag.reading.unpacking import unpack
@@ -147,7 +147,7 @@ def test_quality_of_service_that_cannot_be_read_costs_no_message(tmp_path, qos, 
     announced = SCHEMA + channel(qos)
     summary = announced + STATISTICS if place == "index" else b""
     data = {"index": b"", "file": announced + EMPTY, "chunk": chunk(announced + EMPTY)}[place]
-    with Source(mcap(tmp_path / "odd.mcap", data, summary)) as source:
+    with BagSource(mcap(tmp_path / "odd.mcap", data, summary)) as source:
         assert sum(1 for _ in source.messages()) == (place != "index")
         assert source.topics["/t"].qos == ()
         assert "/t: quality of service that cannot be read (offered_qos_profiles: " in source.contradictions[0]
@@ -165,13 +165,13 @@ def test_header_that_is_longer_than_its_file_is_refused_unread(tmp_path, length)
 
 def test_times_of_an_index_are_not_added_up_in_memory(tmp_path):
     """A chunk of 8 million messages comes in batches."""
-    with Source(mcap(tmp_path / "many.mcap", chunk(SCHEMA + channel() + EMPTY * 100_000))) as source:
+    with BagSource(mcap(tmp_path / "many.mcap", chunk(SCHEMA + channel() + EMPTY * 100_000))) as source:
         assert sum(1 for _ in source.messages()) == 100_000
     writer = bag_writer(tmp_path / "indexed", "/joints", messages.JOINTS, 2**23)
     for number in range(100_000):
         writer.write("/joints", number, b"\0\1\0\0")
     writer.close()
-    with Source(tmp_path / "indexed") as source:
+    with BagSource(tmp_path / "indexed") as source:
         lengths = [len(batch) for batch in source.batches()]
     assert sum(lengths) == 100_000
     assert max(lengths) <= 2**14
@@ -287,7 +287,7 @@ def test_file_that_is_packed_twice_or_behind_what_zstd_skips_is_looked_at(tmp_pa
     inside = mcap(tmp_path / "bad.mcap", b"", SCHEMA + STATISTICS + chunk_index(2**63, 100)).read_bytes()
     for content, said in ((skipped + zstandard.compress(inside), "none can be"), (zstandard.compress(BOMB), "twice")):
         (tmp_path / "x.mcap").write_bytes(content)
-        assert_refused(lambda: Source(tmp_path / "x.mcap"), said)
+        assert_refused(lambda: BagSource(tmp_path / "x.mcap"), said)
 
 
 def test_names_and_numbers_of_a_bag_are_what_they_should_be():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lathe_rc import harness, messages
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.cell.scenario import load
 
 ROOT = Path(__file__).parents[2]
@@ -29,7 +29,7 @@ def demo(request, tmp_path_factory):
     slow = ["spindle_encoder.revolutions=4", "spindle_encoder.speed_factor=0.15"]
     harness.run(load(ROOT / "config" / f"{request.param}.yaml", slow), mode="composed", bag=bag)
     found = {}
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         for topic, _, data in source.messages():
             found.setdefault(topic, []).append(messages.decode(source.topics[topic].type, data))
     return request.param, found

@@ -14,14 +14,14 @@ from lathe_live.panel_player import Player
 from lathe_rc import harness, messages, read_bag
 from lathe_rc.analysis.tolerance import FORCE
 from lathe_rc.bag.loss import HELD, SOUND, loss_of
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.snapshot import SNAPSHOT
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.blocks.wire import Decoder, Encoder
 from lathe_rc.errors import InputError
 from lathe_rc.judge import part
-from lathe_rc.judge.loops import Loop, watches
+from lathe_rc.judge.loops import ServoLoop, watches
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_verdict import BAD, assess
 
@@ -39,7 +39,7 @@ WINDOW = 4096  #: [sample]
 
 def with_loss(source: Path, target: Path, about: dict[str, str], sound: int, first: int = 0) -> Path:
     """Copy a bag from a sample on; from sample ``sound`` on plant a value in all numbers but those of the encoder."""
-    with Source(source) as bag:
+    with BagSource(source) as bag:
         writer = BagWriter(target, compression="zstd", chunk_size=2**20, about={**bag.about, **about})
         for topic, said in bag.topics.items():
             writer.add_topic(topic, said.type, offered_qos(10, "transient_local"))
@@ -156,7 +156,7 @@ def test_a_copy_of_a_bag_names_the_loss_too(whole, lost, tmp_path):
     """A filtered copy, and one together with another bag, end where the members of the first were lost."""
     for name, words in (("part", ["--without", "/tool"]), ("both", [whole, "--topics", "/encoder"])):
         assert lathe("bag", "copy", lost, *words, "-o", tmp_path / name).exit_code == 0
-        with Source(tmp_path / name) as copy:
+        with BagSource(tmp_path / name) as copy:
             assert str(copy.loss) == WHY
 
 
@@ -229,7 +229,7 @@ def test_a_loop_is_judged_up_to_a_fault_of_its_sensor(fault, turns):
     """A dead force sensor shows no error; a hard spot is of the material, and the loop's error with it is real."""
     samples = 4 * 1000
     types = {"/encoder": messages.ENCODER, "/cut": messages.CUT, "/longitudinal/command": messages.SERVO}
-    (watch,) = watches([Loop("force", "longitudinal/command", FORCE, 0, 1.0, 5.0, 1e-3)], types)
+    (watch,) = watches([ServoLoop("force", "longitudinal/command", FORCE, 0, 1.0, 5.0, 1e-3)], types)
     still = np.zeros(samples)
     servo = {"set_point": still + 100.0, "error": still, "command": still}
     dense = {"/encoder": {"angle_true": np.linspace(0.0, 8.0 * np.pi, samples)}, "/longitudinal/command": servo}

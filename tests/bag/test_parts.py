@@ -27,7 +27,7 @@ from lathe_machine.signals.deviation_law import DeviationLaw
 from lathe_machine.signals.part_profile import PartProfile
 from lathe_rc import allowed_code, extensions, harness, messages
 from lathe_rc.bag import provenance
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.cell import batch
 from lathe_rc.cell.parameters import NodeParameters
 from lathe_rc.cell.scenario import Scenario
@@ -99,7 +99,7 @@ def test_every_host_and_block_size_gives_the_same_bits(recorded, tmp_path, mode,
     bag = tmp_path / "bag"
     made = cell({"block_size": block_size})
     assert harness.run(made, mode=mode, groups=in_two(made), bag=bag).digest == recorded[1].digest
-    with Source(recorded[0]) as one, Source(bag) as other:
+    with BagSource(recorded[0]) as one, BagSource(bag) as other:
         assert provenance.origins(other.about) == provenance.origins(one.about)
 
 
@@ -398,7 +398,7 @@ def test_a_bag_says_where_a_stage_of_others_came_from():
 
 def test_an_installed_part_has_a_name_and_its_bag_says_where_it_came_from(installed, tmp_path):
     harness.run(scenario(learning_controller={"q_filter": "hann"}), bag=tmp_path / "bag")
-    with Source(tmp_path / "bag") as source:
+    with BagSource(tmp_path / "bag") as source:
         (origin,) = provenance.origins(source.about)
     assert (origin.name, origin.package) == ("lathe_hann:Hann", "lathe-hann 0.3")
     assert origin.used == ("learning_controller.q_filter",)
@@ -445,7 +445,7 @@ def test_what_is_no_study_is_refused_in_one_line(name, says):
 
 def test_a_bag_without_parts_of_others_says_nothing_of_origins(tmp_path):
     harness.run(scenario(spindle_encoder={"revolutions": 1.0}), bag=tmp_path / "bag")
-    with Source(tmp_path / "bag") as source:
+    with BagSource(tmp_path / "bag") as source:
         assert provenance.ORIGINS not in source.about
 
 
@@ -500,7 +500,7 @@ def test_a_bag_is_read_where_its_parts_are_not_installed(recorded, tmp_path):
 
 def told_by(path, origin):
     """The metadata of a bag, with another origin of its parts."""
-    with Source(path) as source:
+    with BagSource(path) as source:
         about = dict(source.about)
     said = json.loads(about[provenance.ORIGINS])
     return {**about, provenance.ORIGINS: json.dumps({name: {**part, **origin} for name, part in said.items()})}

@@ -37,7 +37,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from lathe_rc import harness, messages
 from lathe_rc.bag.check import check, recorded, write_digests
 from lathe_rc.bag.reading.limits import MOST_BYTES
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.repairing.recover import recover
 from lathe_rc.bag.writing.mcap_file import McapFile
 from lathe_rc.blocks.wire import Encoder
@@ -58,7 +58,7 @@ def test_bags_of_others_are_read_checked_and_recovered(tmp_path, plugin, mode):
     """Cut off anywhere, they give what is whole."""
     bag = tmp_path / "strange"
     sent = strange_bag(bag, plugin, mode)
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         assert list(source.messages()) == sent
         assert {topic: said.count for topic, said in source.topics.items()} == {"/where": 400, "/said": 200}
     assert check(bag).exit_code == 0
@@ -359,7 +359,7 @@ def test_what_a_write_ahead_log_does_not_give_is_told(tmp_path, kind):
     assert (found.lossy, bool(found.lost_bytes)) == (lost, lost)
     assert found.saved == 50 if kind in ("whole", "not written to the end") else 30 <= found.saved < 50
     assert read_by_others(tmp_path / "new") == sent[: found.saved]
-    with Source(bag, partial=True) as source:
+    with BagSource(bag, partial=True) as source:
         assert list(source.messages()) == sent[: found.saved]
     checked = lathe("bag", "check", bag)
     told = f"{found.lost_bytes} B of its write-ahead log are broken, or were not written to the end"
@@ -384,7 +384,7 @@ def broken_off(tmp_path):
 
 def test_a_write_that_was_broken_off_is_taken_back(broken_off, tmp_path):
     journal, sent = broken_off
-    with Source(journal.parent) as source:
+    with BagSource(journal.parent) as source:
         assert list(source.messages()) == sent
     assert recover(journal.parent, tmp_path / "new").saved == len(sent)
 
@@ -398,7 +398,7 @@ def test_a_journal_that_names_a_further_file_is_refused_and_the_file_stays(broke
     tail = struct.pack(">I", 0) + name + struct.pack(">II", len(name), sum(name)) + b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
     journal.write_bytes(journal.read_bytes() + tail)
     with pytest.raises(InputError, match="it names a further journal"):
-        Source(journal.parent)
+        BagSource(journal.parent)
     assert recover(journal.parent, tmp_path / "new").lossy
     assert named.read_bytes() == b"mine"
 
@@ -407,7 +407,7 @@ def test_a_log_that_is_a_link_is_refused(broken_off, tmp_path):
     """A bag reads nothing outside of its folder; a database that the user names by a link has its logs elsewhere."""
     journal, sent = broken_off
     (tmp_path / "linked.db3").symlink_to(journal.with_name("bag.db3"))
-    with Source(tmp_path / "linked.db3") as source:
+    with BagSource(tmp_path / "linked.db3") as source:
         assert list(source.messages()) == sent
     journal.rename(tmp_path / "outside")
     journal.symlink_to(tmp_path / "outside")
@@ -442,7 +442,7 @@ def test_files_that_overlap_in_any_way_are_merged_by_time(tmp_path, kind):
     sent = sorted([(t, b"%d" % n) for n, times in enumerate(files) for t in times], key=lambda said: said[0])
     assert recover(path, tmp_path / "new").saved == len(sent)
     for bag in (path, tmp_path / "new"):
-        with Source(bag) as source:
+        with BagSource(bag) as source:
             assert [(log_ns, data) for _, log_ns, data in source.messages()] == sent
 
 
@@ -453,7 +453,7 @@ def test_a_compressed_file_that_a_player_unpacked_beside_is_read_once(tmp_path):
     assert check(tmp_path / "bag").exit_code == 0
     assert recover(tmp_path / "bag", tmp_path / "new").saved == len(sent)
     (tmp_path / "bag" / "metadata.yaml").unlink()
-    with Source(tmp_path / "bag") as source:
+    with BagSource(tmp_path / "bag") as source:
         assert list(source.messages()) == sent
 
 
@@ -510,7 +510,7 @@ def test_topics_in_other_serializations_are_named_and_copied_and_the_rest_is_rea
     sent = strange_bag(tmp_path / "bag", StoragePlugin.SQLITE3)
     with sqlite3.connect(tmp_path / "bag" / "bag.db3") as database:
         database.execute("UPDATE topics SET serialization_format = 'xdr' WHERE name = '/said'")
-    with Source(tmp_path / "bag") as source:
+    with BagSource(tmp_path / "bag") as source:
         assert list(source.messages()) == [message for message in sent if message[0] != "/said"]
     said = "not read: /said std_msgs/msg/String, 200 messages serialized as 'xdr', not 'cdr'"
     for command in ("info", "check"):
@@ -532,7 +532,7 @@ def test_the_files_count_where_the_metadata_contradict_them(tmp_path, plugin):
     told["starting_time"]["nanoseconds_since_epoch"] += 100_000
     told["topics_with_message_count"][1]["message_count"] = 20
     (path / "metadata.yaml").write_text(yaml.safe_dump(metadata))
-    with Source(path) as source:
+    with BagSource(path) as source:
         assert list(source.messages()) == sent
         assert (source.first_ns, source.last_ns) == (sent[0][1], sent[-1][1])
         assert source.topics["/said"].count == 200
@@ -556,12 +556,12 @@ def test_what_unpacks_to_gigabytes_is_refused(tmp_path, monkeypatch):
     with sqlite3.connect(storage_of(tmp_path / "messages")) as database:
         database.execute("UPDATE messages SET data = ? WHERE id = 1", (bomb,))
     refused = pytest.raises(InputError, match=f"{MOST_BYTES + 1} B when unpacked; allowed: up to {MOST_BYTES}")
-    with Source(tmp_path / "messages") as source, refused:
+    with BagSource(tmp_path / "messages") as source, refused:
         list(source.messages())
     monkeypatch.setattr("lathe_rc.bag.reading.unpacking.MOST_SMALL", 0)
     monkeypatch.setattr("lathe_rc.bag.reading.unpacking.EXPANSION", 1)
     with pytest.raises(InputError, match="unpacks to more than 1 times its size"):
-        Source(tmp_path / "file")
+        BagSource(tmp_path / "file")
 
 
 def test_a_bag_of_a_cell_that_did_not_begin_is_not_clean(tmp_path):

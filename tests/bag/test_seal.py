@@ -14,7 +14,7 @@ import lathe_rc
 from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.loss import HELD
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.writing.writer import BagWriter
 from lathe_rc.errors import InputError
 
@@ -168,9 +168,9 @@ def test_a_bag_of_an_earlier_version_has_no_seal_and_is_named(bag):
     with sealed_bags.unsealed():
         old = sealed_bags.made(bag.with_name("old"))
     with pytest.raises(InputError, match=r"old.mcap has no seal that holds: .* an earlier version"):
-        Source(old)
+        BagSource(old)
     assert lathe("bag", "recover", old, "-o", bag.with_name("new")).exit_code == 0
-    with Source(bag.with_name("new")) as source:
+    with BagSource(bag.with_name("new")) as source:
         assert source.about[provenance.RECOVERED].endswith("; from a bag without a seal that holds")
 
 
@@ -179,7 +179,7 @@ def test_a_bag_of_an_earlier_version_has_no_seal_and_is_named(bag):
 
 def told(bag):
     """The seal and the strings of a bag."""
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         return str(source.seal), source.about
 
 

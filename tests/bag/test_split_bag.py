@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from lathe_rc import harness
 from lathe_rc.bag import reader
 from lathe_rc.bag.check import check
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.repairing import recover
 
 
@@ -63,7 +63,7 @@ def test_a_split_bag_of_a_killed_recorder_is_completed(bags, tmp_path):
     with (cut / "split_2.mcap").open("r+b") as stream:
         stream.truncate(stream.seek(0, 2) - 3000)
     found = recover.mend(cut)
-    with Source(cut) as source, Source(split) as before:
+    with BagSource(cut) as source, BagSource(split) as before:
         assert source.damage == []
         assert found.saved == sum(topic.count for topic in source.topics.values())
         assert source.first_ns == before.first_ns

@@ -27,7 +27,7 @@ from lathe_bagtools.nodes import replayed_qos, replayer
 from lathe_rc import harness
 from lathe_rc.bag.check import check
 from lathe_rc.bag.reading import metadata
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.errors import InputError
 
 try:
@@ -49,7 +49,7 @@ def test_a_replayed_cell_is_recorded_as_the_same_bag(domain, tmp_path):
         ((code, said),) = refusals(["replay", first, "--rate", "0", "--as-cell"])
         assert code == 0, said
         assert recorder.wait() == 0, recorder.stdout.read()
-    with Source(first) as old, Source(again) as new:
+    with BagSource(first) as old, BagSource(again) as new:
         signals = set(old.topics) - {"/diagnostics", "/cell_state"}
         assert len(signals) == 9
         assert list(old.messages(signals)) == list(new.messages(signals))

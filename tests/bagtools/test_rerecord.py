@@ -21,7 +21,7 @@ from std_msgs.msg import Empty, String
 from lathe_bagtools.nodes.topic_recorder import TopicRecorder, TopicRecorderParameters
 from lathe_rc import harness
 from lathe_rc.bag.check import check
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.writing.writer import offered_qos
 from lathe_rc.errors import InputError
 from lathe_rc.nodes import publisher_info
@@ -89,7 +89,7 @@ def recorded_again(bag, again, *recorder, topics=()):
 
 
 def messages(path):
-    with Source(path) as source:
+    with BagSource(path) as source:
         return list(source.messages())
 
 

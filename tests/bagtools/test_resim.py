@@ -14,7 +14,7 @@ from sealed_bags import retold
 from lathe_bagtools.resimulation.resim import resimulate
 from lathe_rc import harness
 from lathe_rc.bag import provenance, reader
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.stream import feed
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.running_form import RunningForm
@@ -64,7 +64,7 @@ def test_what_it_writes_is_the_bag_again(nodes, tmp_path):
     assert lathe("resim", path, "-o", tmp_path / "again").exit_code == 0
     assert reader.read_bag(tmp_path / "again").digests() == result.digest
     signals = {topic for topic, kind in result.recording.types.items()}
-    with Source(path) as old, Source(tmp_path / "again") as new:
+    with BagSource(path) as old, BagSource(tmp_path / "again") as new:
         assert list(old.messages(signals)) == list(new.messages())
 
 
@@ -104,7 +104,7 @@ def test_the_recorded_spindle_counts_not_the_law(nodes, tmp_path):
     harness.run(made(spindle_encoder=slow), bag=other)
     said = provenance.SCENARIO
     retold(other, lambda about: about.update({said: about[said].replace("amplitude: [0.05]", "amplitude: [0.02]")}))
-    with Source(other) as source:
+    with BagSource(other) as source:
         assert "deviation_amplitude: [0.02]" in source.about[provenance.SCENARIO]
     assert resimulate(other).different == []
 
@@ -119,7 +119,7 @@ def test_the_bag_holds_the_files_of_its_scenario(tmp_path):
 
 def test_versions_and_identity_are_in_the_bag(nodes):
     path, result = nodes
-    with Source(path) as source:
+    with BagSource(path) as source:
         assert json.loads(source.about[provenance.VERSIONS])["numpy"] == np.__version__
         assert source.about[provenance.RUN_ID] == result.scenario.shared.run_id
         assert json.loads(source.about[provenance.HOST_TOPICS]) == ["/diagnostics", "/cell_state"]

@@ -17,7 +17,7 @@ from lathe_machine.analysis import drive_fit
 from lathe_machine.plants.electrodynamic import ElectrodynamicDrive
 from lathe_machine.signals.measured_profile import read_csv
 from lathe_rc import harness, messages, resources
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.errors import InputError
 
@@ -181,7 +181,7 @@ def test_a_machine_that_knows_no_truth_and_began_elsewhere(clean, tmp_path):
 
 def test_a_bag_with_its_scenario_and_not_all_topics_is_compared_in_what_it_has(clean, tmp_path):
     result, part = clean
-    with Source(part.parent / "whole") as source:
+    with BagSource(part.parent / "whole") as source:
         about = dict(source.about)
     bag = stripped(part.parent / "whole", tmp_path / "bag", [ENCODER, STATE], about=about)
     told = json.loads(lathe("resim", bag, "--json").stdout)

@@ -21,7 +21,7 @@ from sealed_bags import retold
 
 from lathe_rc import allowed_code, extensions, harness
 from lathe_rc.bag import provenance
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.cell import scenario as scenarios
 from lathe_rc.cell.kinds import STAGES
 from lathe_rc.cell.scenario import TABLES
@@ -84,7 +84,7 @@ class Received:
 
     def scenario(self, place, node, **values):
         """Write the bag's scenario to a file, with other values."""
-        with Source(self.bag) as source:
+        with BagSource(self.bag) as source:
             tree = yaml.safe_load(source.about[provenance.SCENARIO])
         del tree["/**/tool"]["ros__parameters"]["profile_file"]
         tree["/**/tool"]["ros__parameters"]["profile"] = "harmonics"
@@ -329,7 +329,7 @@ def test_no_file_that_a_bag_names_gets_into_the_new_bag(received, node, place):
         Path("own.csv").write_text(FORM)
         found = lathe("resim", received.bag, "-o", "new", "--set", "tool.profile_file=own.csv")
     assert found.exit_code == 0, found.output
-    with Source(Path("new")) as source:
+    with BagSource(Path("new")) as source:
         kept = [base64.b64decode(text) for key, text in source.about.items() if key.startswith(provenance.FILE)]
     assert kept == [FORM.encode()]
     assert received.secret.read_text() == "1,2\nmine\n"

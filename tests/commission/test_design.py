@@ -37,7 +37,7 @@ def few(monkeypatch):
         name: design.LAWS[name]
         for name in ("lead, Gaussian Q", "measured, flat Q", "inverse, Gaussian Q", "disturbance")
     }
-    laws["disturbance"] = design.Law(
+    laws["disturbance"] = design.FilteredLaw(
         "disturbance_controller",
         {"identify": False},
         [{"learned_waves": waves, "observer_bandwidth": 0.0} for waves in (8.0, 60.0)],

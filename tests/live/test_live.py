@@ -22,11 +22,11 @@ from test_view import View, lathe, refused
 from lathe_live import rerun_part as parts
 from lathe_live.live_runs import Backlog, RunOrder
 from lathe_live.rerun_live import Live
-from lathe_live.rerun_output import Output
+from lathe_live.rerun_output import LiveOutput
 from lathe_live.rerun_signals import is_drawn
 from lathe_rc import harness, messages
 from lathe_rc.bag import reader
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.cell.scenario import load
 from lathe_rc.errors import LatheError
 from lathe_rc.nodes import dds
@@ -84,7 +84,7 @@ def turned(tmp_path_factory):
     given = {"profile": "harmonics", "harmonic_order": [1], "harmonic_amplitude": [20e-6]}
     learning = {"events": ["revolution 9: freeze"]}
     harness.run(scenario(spindle_encoder={"revolutions": 12.3}, tool=given, learning_controller=learning), bag=bag)
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         types = {topic: kind.type for topic, kind in source.topics.items() if is_drawn(kind.type)}
         return bag, [(topic, types[topic], data) for topic, _, data in source.messages(set(types))], types
 
@@ -94,7 +94,7 @@ class Watched:
 
     def __init__(self, folder, types, known=None):
         self.said = []
-        output = Output("save", file=folder / "live.rrd", url="", port=0)
+        output = LiveOutput("save", file=folder / "live.rrd", url="", port=0)
         self.live = Live(output.open, rate=2000.0, say=self.said.append, scenario=known)
         self.live.present = types
 

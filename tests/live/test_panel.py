@@ -33,7 +33,7 @@ from lathe_live.rerun_signals import is_drawn
 from lathe_machine.safety import next_step
 from lathe_rc import event_log, harness, messages
 from lathe_rc.analysis.tolerance import growth, judge
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.cell.parameters import form_doubt, judged
 from lathe_rc.cell.running_form import RunningForm
 from lathe_rc.cell.scenario import load
@@ -464,7 +464,7 @@ def test_a_folder_without_a_bag_is_not_played(tmp_path):
 @pytest.fixture(scope="module")
 def retracted(bag):
     """The message types of a cell that is retracted in revolution 5, and what would be heard of it."""
-    with Source(bag) as source:
+    with BagSource(bag) as source:
         types = {topic: kind.type for topic, kind in source.topics.items()}
         types = {topic: kind for topic, kind in types.items() if is_drawn(kind) or kind in LivePanel.urgent}
         return types, [(topic, types[topic], data) for topic, _, data in source.messages(set(types))]

@@ -13,7 +13,7 @@ from lathe_live.panel_player import Player
 from lathe_live.panel_run import Driver
 from lathe_live.panel_topics import Topics
 from lathe_live.panel_view import MOST_ROWS, View
-from lathe_live.rerun_revolutions import ANGLES, Revolution
+from lathe_live.rerun_revolutions import ANGLES, DrawnRevolution
 from lathe_rc import event_log, messages
 from lathe_rc.errors import InputError, LatheError
 from lathe_rc.safety.state_machine import State
@@ -209,7 +209,7 @@ def test_the_map_of_a_long_run_shows_the_largest_error_of_all_its_revolutions():
     errors[345, 120] = 50e-6
     for number, error in enumerate(errors, start=1):
         view._out = (1094, np.inf) if number == 1094 else view._out
-        view._add([Revolution(number, number, error, -error, 0.0, 1e-7, 1e-7)])
+        view._add([DrawnRevolution(number, number, error, -error, 0.0, 1e-7, 1e-7)])
     rows = [*view._rows, view._open]
     assert MOST_ROWS // 2 < len(rows) <= MOST_ROWS
     assert [row.since for row in rows[1:]] == [row.number + 1 for row in rows[:-1]]

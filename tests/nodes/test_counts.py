@@ -26,7 +26,7 @@ from lathe_rc.cell.scenario import Scenario
 from lathe_rc.cli import main
 from lathe_rc.errors import LatheError
 from lathe_rc.signals import speed
-from lathe_rc.view.report_form import Form
+from lathe_rc.view.report_form import FormByRevolution
 
 STEP_NS, COUNTS = 15_625, 1000
 TURN = 2 * np.pi
@@ -607,7 +607,7 @@ def test_a_bag_with_a_standstill_goes_through_every_command(path, tmp_path):
     rms = info["error_um"]["last"]["rms"]
     assert rms == pytest.approx(result.errors.rms[-1] * 1e6, rel=0.01)
     assert (stands["standstill"], stands["stands_from"]) == pytest.approx((0.067, 1e-3), abs=2e-4)
-    form = Form("/encoder", "/tool")
+    form = FormByRevolution("/encoder", "/tool")
     stream.feed(bag, [form])
     form.finish()
     assert form.refused == ""

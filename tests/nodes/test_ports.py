@@ -16,7 +16,7 @@ from lathe_rc.errors import LatheError
 from lathe_rc.nodes.refused_messages import RefusedMessages
 from lathe_rc.protocol import BadBlock, ForeignMessage
 from lathe_rc.protocol.block_queue import BlockQueue
-from lathe_rc.protocol.exchange import Run
+from lathe_rc.protocol.exchange import JoinedBlocks
 from lathe_rc.protocol.inputs import Inputs
 
 SIZE = 4
@@ -42,13 +42,13 @@ def late(data) -> bytes:
     return messages.encode(messages.ENCODER, made)
 
 
-def run_of(first, count, *, last=False) -> Run:
+def run_of(first, count, *, last=False) -> JoinedBlocks:
     """Blocks in one piece, the last of them shorter if the run ends with it."""
     samples = count * SIZE - (1 if last else 0)
     signals = messages.allocate(messages.ENCODER, samples)
     signals["angle"][:] = np.arange(first, first + samples)
     made = Encoder(messages.ENCODER, "run", "/spindle", 15_625)
-    return Run(made.block(first, signals, None, last=last, companions=0), [0] * count)
+    return JoinedBlocks(made.block(first, signals, None, last=last, companions=0), [0] * count)
 
 
 def test_blocks_in_one_piece_count_one_by_one_and_are_taken_in_any_pieces():

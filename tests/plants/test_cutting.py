@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from lathe_machine.plants.cutting import GIVEN, MADE, CuttingProcess
 from lathe_machine.plants.cutting_force import PAPER, REALISTIC, RIGID, STEEL, Elasticity, Flank, SpecificForce, Wear
-from lathe_machine.plants.workpiece import HardSpot, Part
+from lathe_machine.plants.workpiece import HardSpot, Workpiece
 from lathe_machine.signals.allowance import PAPER_RMS, Allowance, mean_reverting
 from lathe_machine.transfer import LinearSystem, TransferFunction
 from lathe_rc.errors import LatheError
@@ -120,7 +120,7 @@ def test_keyway_leaves_its_part_of_a_revolution_uncut(start, width, begin):
     """A second keyway within the first makes no difference."""
     samples = 4000
     angle = begin + 2 * np.pi * (np.arange(samples) + 0.5) / samples
-    out = cut(make(part=Part(gaps=[(start, width), (start, width / 3)])), samples, angle=angle)
+    out = cut(make(part=Workpiece(gaps=[(start, width), (start, width / 3)])), samples, angle=angle)
     gap = out["depth_of_cut"] == 0.0
     assert abs(gap.mean() - width / (2 * np.pi)) <= 1.5 / samples
     middle = np.cos(angle - start - width / 2)
@@ -130,7 +130,7 @@ def test_keyway_leaves_its_part_of_a_revolution_uncut(start, width, begin):
 
 def test_hard_spot_is_a_window_of_angle_and_height():
     spots = [HardSpot(6.0, 0.6, 0.01, 0.02, 1.5), HardSpot(0.1, 0.1, 0.0, 1.0, 2.0)]
-    process = make(part=Part(hard_spots=spots))
+    process = make(part=Workpiece(hard_spots=spots))
     angle = np.array([6.1, 0.05, 0.15, 0.25, 0.4, 6.1, 6.1, 0.15])
     height = np.array([0.015, 0.015, 0.015, 0.015, 0.015, 0.005, 0.021, 0.5])
     factor = cut(process, 8, angle=angle, height=height)["force"] / 150.0
@@ -142,7 +142,7 @@ def test_hard_spot_is_a_window_of_angle_and_height():
 
 def test_wear_grows_with_time_and_path_in_the_cut():
     wear = Wear(initial=1e-5, per_metre=1e-7, per_second=1e-6)
-    process = make(wear=wear, part=Part(radius=0.04), material=SpecificForce(wear_factor=1000.0))
+    process = make(wear=wear, part=Workpiece(radius=0.04), material=SpecificForce(wear_factor=1000.0))
     cross = np.where(np.arange(64_000) < 32_000, 0.0, 2 * DEPTH)  # half a second of cutting
     out = cut(process, 64_000, cross_position=cross)
     time = np.minimum(np.arange(64_000), 32_000) * STEP
@@ -198,7 +198,7 @@ def test_presets_are_the_modes_that_the_spec_says():
 
 
 def test_compliance_follows_the_height():
-    part = Part(heights=np.array([0.0, 0.1, 0.2]), compliances=np.array([1e-7, 5e-7, 1e-7]))
+    part = Workpiece(heights=np.array([0.0, 0.1, 0.2]), compliances=np.array([1e-7, 5e-7, 1e-7]))
     elasticity = Elasticity(1.0, 0.0, 0.0, away=True)  # its shape alone counts
     height = np.array([-1.0, 0.0, 0.05, 0.1, 0.175, 0.3])
     out = cut(make(elasticity=elasticity, part=part), 6, height=height)
@@ -211,7 +211,7 @@ def test_compliance_follows_the_height():
 def test_flank_presses_by_the_speed_of_the_edge_and_the_square_of_its_land():
     """F = K·ap - Ksp·B·(W + VB)²/2·(dy/dt)/v where there is a chip, and nothing in a keyway."""
     flank = Flank(pressure=4e13, width=0.3e-3, land=0.1e-3)
-    process = make(flank=flank, wear=Wear(0.1e-3), part=Part(radius=0.04, gaps=[(3.0, 1.0)]))
+    process = make(flank=flank, wear=Wear(0.1e-3), part=Workpiece(radius=0.04, gaps=[(3.0, 1.0)]))
     time = STEP * np.arange(8000)
     away = 50e-6 * np.sin(2 * SPEED * time)
     out = cut(process, 8000, displacement=away)
@@ -287,7 +287,7 @@ def test_cuts_change_nothing(lengths, lag, elasticity, overlap):
         "feed_velocity": random.normal(1e-3, 1e-3, samples),
         "allowance": random.normal(scale=1e-5, size=samples),
     }
-    part = Part(gaps=[(1.0, 0.5)], hard_spots=[HardSpot(3.0, 1.0, 0.02, 0.05, 2.0)])
+    part = Workpiece(gaps=[(1.0, 0.5)], hard_spots=[HardSpot(3.0, 1.0, 0.02, 0.05, 2.0)])
     options = {
         "lag": lag, "elasticity": elasticity, "overlap": overlap, "part": part,
         "wear": Wear(0.0, 1e-6, 1e-6), "material": SpecificForce(wear_factor=1e3),
@@ -305,11 +305,11 @@ def test_cuts_change_nothing(lengths, lag, elasticity, overlap):
     (lambda: make(elasticity=Elasticity(-1e-7, 0.0, 0.0, away=True)), "compliance -1e-07; allowed: 0 or more"),
     (lambda: make(elasticity=Elasticity(1e-7, 1e-5, 0.0, away=True)), "damping 0 of the edge with inertia"),
     (lambda: make(wear=Wear(per_second=-1.0)), "cutting: per_second -1; allowed: 0 or more"),
-    (lambda: Part(radius=0.0), "part: radius 0 m"),
-    (lambda: Part(gaps=[(0.0, 7.0)]), "keyway: window at 0 rad of 7 rad; allowed: a width"),
-    (lambda: Part(heights=np.zeros(1)), "heights without compliances"),
-    (lambda: Part(heights=np.zeros(2), compliances=np.zeros(2)), "heights have to rise"),
-    (lambda: Part(heights=np.zeros(2), compliances=np.zeros(1)), "2 heights and 1 compliances"),
+    (lambda: Workpiece(radius=0.0), "part: radius 0 m"),
+    (lambda: Workpiece(gaps=[(0.0, 7.0)]), "keyway: window at 0 rad of 7 rad; allowed: a width"),
+    (lambda: Workpiece(heights=np.zeros(1)), "heights without compliances"),
+    (lambda: Workpiece(heights=np.zeros(2), compliances=np.zeros(2)), "heights have to rise"),
+    (lambda: Workpiece(heights=np.zeros(2), compliances=np.zeros(1)), "2 heights and 1 compliances"),
     (lambda: HardSpot(0.0, 1.0, 0.1, 0.1, 2.0), "hard spot from 0.1 to 0.1 m"),
     (lambda: HardSpot(0.0, 1.0, 0.0, 0.1, -2.0), "hard spot: factor -2"),
     (lambda: make(lag=1e-9), "cutting: lag 1e-09 s at a step of 1.5625e-05 s; allowed: 0 or at least 1.5625e-08"),

@@ -13,7 +13,7 @@ from machines import assert_refused, refusals
 from machines import run as run_in_blocks
 from numpy.testing import assert_allclose
 
-from lathe_commission.hysteresis_fit import Loop, from_signals, identify, of_measurement
+from lathe_commission.hysteresis_fit import HysteresisLoop, from_signals, identify, of_measurement
 from lathe_machine.plants.hysteresis import PROPORTIONAL, THRESHOLDS, WEIGHTS, BoucWen, PrandtlIshlinskii, plays
 from lathe_papers.formulas.vibration import describing_function
 from lathe_rc.signals.measurement_file import read
@@ -196,14 +196,14 @@ def measured(model=None, amplitude=1.0, first=0, noise=0.0):
     """A loop of a drive, some periods of a sine from sample ``first`` on, its displacement 3 µm off."""
     value = amplitude * np.sin(2.0 * np.pi * np.arange(9000) / 3000)
     result = run(model or PrandtlIshlinskii(), value) + noise * np.random.default_rng(3).normal(size=value.size)
-    return Loop(value[first:] * STROKE, result[first:] * STROKE + 3e-6)
+    return HysteresisLoop(value[first:] * STROKE, result[first:] * STROKE + 3e-6)
 
 
 def test_drive_that_only_pushes_is_identified_from_rest():
     thresholds = THRESHOLDS[:4]
     command = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(9000) / 3000)
     response = run(PrandtlIshlinskii(thresholds, WEIGHTS[:4]), command)
-    found = identify(Loop(command * STROKE, response * STROKE), STROKE, thresholds)
+    found = identify(HysteresisLoop(command * STROKE, response * STROKE), STROKE, thresholds)
     assert_allclose(found.model.weights, WEIGHTS[:4], atol=1e-10)
 
 
@@ -237,14 +237,14 @@ def test_plays_come_near_another_hysteresis():
 def test_weights_are_not_negative():
     """A loop that goes round the other way has no such model: what is left says so."""
     loop = measured()
-    found = identify(Loop(loop.command, 2.0 * loop.command - loop.displacement), STROKE)
+    found = identify(HysteresisLoop(loop.command, 2.0 * loop.command - loop.displacement), STROKE)
     assert np.all(found.model.weights >= 0.0)
     assert found.residual > 0.05
 
 
 def fitted(command, displacement, thresholds=THRESHOLDS):
     """An identification of a loop that is yet to be measured."""
-    return lambda: identify(Loop(np.asarray(command), np.asarray(displacement)), STROKE, thresholds)
+    return lambda: identify(HysteresisLoop(np.asarray(command), np.asarray(displacement)), STROKE, thresholds)
 
 
 WHOLE = measured()

@@ -15,7 +15,7 @@ from lathe_machine.plants.cutting import CuttingProcess
 from lathe_machine.plants.cutting_force import RIGID, SpecificForce
 from lathe_machine.plants.piezo import Stack
 from lathe_machine.plants.tool_drive import Piezo, ToolDrive
-from lathe_machine.plants.workpiece import Part
+from lathe_machine.plants.workpiece import Workpiece
 from lathe_machine.transfer import TransferFunction
 from lathe_papers.formulas.loaded import compliance, compliance_in_series
 from lathe_rc import harness
@@ -153,7 +153,7 @@ def run_with_a_keyway(machine, step, samples=12_000, **given):
     """A form out of a round blank with a keyway: command, what is made, and the radial force."""
     time = step * np.arange(samples)
     command = 100e-6 * np.sin(2 * SPEED * time) * np.minimum(time / 5e-3, 1.0)
-    process = cutting(step=step, lag=0.5e-3, part=Part(gaps=[(0.5, 0.5)]))
+    process = cutting(step=step, lag=0.5e-3, part=Workpiece(gaps=[(0.5, 0.5)]))
     made = machine.block(process, 0, turning(samples, step, command=command, **given))
     assert made["depth_of_cut"].min() == 0.0 < made["depth_of_cut"].max()  # it has been through the keyway
     late = round(DELAY / step)

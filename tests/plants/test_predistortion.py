@@ -14,7 +14,7 @@ from lathe_machine.analysis.shaft import Shaft
 from lathe_machine.control.predistortion import Predistortion, cancelling, contraction, proportional, turned
 from lathe_machine.plants.cutting import CuttingProcess
 from lathe_machine.plants.cutting_force import STEEL, Elasticity
-from lathe_machine.plants.workpiece import Part
+from lathe_machine.plants.workpiece import Workpiece
 from lathe_rc.errors import InputError
 
 STIFFNESS = 233.3e3  # [N/m]
@@ -124,7 +124,7 @@ def test_cutting_process_turns_the_shaft_straight():
     speed = np.full(samples, 100.0)
     height = np.linspace(0.0, 0.6, samples)
     feed = STEEL.feed_for(STIFFNESS)
-    part = Part(heights=HEIGHTS, compliances=COMPLIANCE)
+    part = Workpiece(heights=HEIGHTS, compliances=COMPLIANCE)
     elasticity = Elasticity(1.0, 0.003**2, 0.0005, away=True)
     errors = []
     for offsets in (np.zeros(61), cancelling(COMPLIANCE, proportional(STIFFNESS), DEPTH)):

@@ -37,7 +37,7 @@ from lathe_papers.formulas import step_fit
 from lathe_rc import data_file, files, harness, messages
 from lathe_rc.bag import check, provenance, reader
 from lathe_rc.bag.reading import seal
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.repairing import recover
 from lathe_rc.bag.writing.writer import BagWriter
 from lathe_rc.blocks.wire import Encoder
@@ -292,7 +292,7 @@ def _read_bag(path: Path) -> None:
     for read in (check.check, reader.read_bag, gather, lambda bag: recover.recover(bag, bag.with_name("saved"))):
         with refusals():
             read(path)
-    with refusals(), Source(path) as source:
+    with refusals(), BagSource(path) as source:
         for _ in source.messages(start_ns=source.first_ns + 1):
             pass
 

@@ -13,7 +13,7 @@ import pyarrow.parquet
 from lathe_explore.sweep import row, study, tune
 from lathe_explore.sweep.folder import Folder, Request
 from lathe_explore.sweep.space import Space
-from lathe_explore.sweep.study import Study
+from lathe_explore.sweep.study import TuningStudy
 from lathe_explore.sweep.sweep import ignore
 from lathe_machine.control import memory_file
 from lathe_machine.signals import profile_table
@@ -65,7 +65,7 @@ def tuned(path: Path, trials: int = 8) -> Folder:
     told = Request([LEAD], {LEAD: "1e-3:2e-3"}, ["tool.rms_error"], [], 100.0, Space(), "tpe", 0, 4, formulas=False)
     start = load().varied({LEAD: 1.8e-3})
     folder = Folder.begin(path, start, None, [], told)
-    state = Study(folder)
+    state = TuningStudy(folder)
     while asked := state.ask(trials):
         state.compute(None, asked, ignore)
     return folder

@@ -34,7 +34,7 @@ from lathe_rc.protocol import (
     actions,
 )
 from lathe_rc.protocol.block_queue import BlockQueue
-from lathe_rc.protocol.exchange import Exchange, Run
+from lathe_rc.protocol.exchange import Exchange, JoinedBlocks
 from lathe_rc.protocol.inputs import Inputs
 from lathe_rc.protocol.leading_run import LeadingRun
 from lathe_rc.protocol.member_host import MemberHost
@@ -508,7 +508,7 @@ class Stage(StageRun):
         node.process.free_at = max(node.process.free_at, self.sim.now) + node.process.cost
         if not node.design.records:
             signals = {"position": np.repeat(np.array(self.values[begin:], float), SIZE)[:samples]}
-            run = Run(self._encoder.block(first, signals, None, last=last, companions=0), [0] * count)
+            run = JoinedBlocks(self._encoder.block(first, signals, None, last=last, companions=0), [0] * count)
             for block in run.blocks(SIZE):
                 spoils, node.spoils = node.spoils, 0
                 self.sim.network.publish(node.identity, self.name, self._message(block, spoils))

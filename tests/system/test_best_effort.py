@@ -5,7 +5,7 @@ import pytest
 from cells import scenario, started
 
 from lathe_rc import harness
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.errors import LossyRunError
 
 pytestmark = pytest.mark.system
@@ -60,5 +60,5 @@ def test_blocks_that_a_best_effort_device_loses_are_held_counted_and_named(domai
         pytest.raises(LossyRunError, match=rf"lost \d+ blocks of a free-running cell: \d+ of {TOPIC} from sample 0 on"),
     ):
         processes.wait_for_end()
-    with Source(tmp_path / "bag") as bag:
+    with BagSource(tmp_path / "bag") as bag:
         assert str(bag.loss) == f"not read from sample 0 on: {TOPIC} is held from sample 0 on, where blocks were lost"

@@ -121,7 +121,7 @@ def one(number, folder):
 @pytest.fixture
 def thinned(monkeypatch):
     few = {
-        name: design.Law(law.kind, law.fixed, law.filters[:: max(1, len(law.filters) // THINNED)], law.lead)
+        name: design.FilteredLaw(law.kind, law.fixed, law.filters[:: max(1, len(law.filters) // THINNED)], law.lead)
         for name, law in design.LAWS.items()
     }
     monkeypatch.setattr(design, "LAWS", few)

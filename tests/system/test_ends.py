@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 from lathe_rc import harness
 from lathe_rc.bag.check import check
 from lathe_rc.bag.loss import HELD
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.errors import LatheError
 
 pytestmark = pytest.mark.system
@@ -95,5 +95,5 @@ def test_a_member_that_alone_gets_a_signal_is_lost_and_named(endless, tmp_path):
     os.kill(endless.pids["tool"], signal.SIGINT)
     with pytest.raises(LatheError, match="/tool was ended by SIGINT in the middle of a run: safe state from sample"):
         endless.wait_for_end()
-    with Source(tmp_path / "bag") as bag:
+    with BagSource(tmp_path / "bag") as bag:
         assert '"/tool"' in bag.about[HELD]

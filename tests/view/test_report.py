@@ -19,7 +19,7 @@ from shown_page import ShownPage
 
 from lathe_rc import __version__, harness, messages, resources
 from lathe_rc.bag import provenance
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.writing.writer import BagWriter, offered_qos
 from lathe_rc.blocks.latency_histogram import LATENCY, LATENESS, Durations
 from lathe_rc.cell.scenario import load
@@ -31,7 +31,7 @@ from lathe_rc.judge.causes import changing
 from lathe_rc.view import report as reporting
 from lathe_rc.view.form_limits import form_limits
 from lathe_rc.view.report_figures import against_time, colour_range, spectrum_range, timing
-from lathe_rc.view.report_form import Form, Revolution
+from lathe_rc.view.report_form import FormByRevolution, Revolution
 from lathe_rc.view.report_gather import gather
 from lathe_rc.view.report_host import DIAGNOSTICS, Host
 from lathe_rc.view.report_series import Envelope, MeanRows
@@ -252,7 +252,7 @@ class TestForm:
 
     @staticmethod
     def of(angle, error, pieces=1):
-        form, first = Form("/encoder", "/tool"), 0
+        form, first = FormByRevolution("/encoder", "/tool"), 0
         for part_, errors in zip(np.array_split(angle, pieces), np.array_split(error, pieces), strict=True):
             form.chunk(first, part_.size, {"/encoder": {"angle_true": part_}, "/tool": {"error": errors}}, {})
             first += part_.size
@@ -490,7 +490,7 @@ def test_a_bag_of_something_else_has_a_page_too(tmp_path):
 def test_a_gap_stops_the_reading_and_is_reported(turned, tmp_path):
     """The same recording without one block of the tool, in the fifth revolution."""
     writer = BagWriter(tmp_path / "bag", compression="none", chunk_size=2**16, about={})
-    with Source(turned.bag) as source:
+    with BagSource(turned.bag) as source:
         for topic, found in source.topics.items():
             writer.add_topic(topic, found.type, offered_qos(10, "volatile"))
         blocks = 0

@@ -11,7 +11,7 @@ from lathe_machine.analysis.shaft import STEEL_MODULUS, Shaft, Support
 from lathe_machine.plants.chip import STOPS, CutTable, failure
 from lathe_machine.plants.cutting import CuttingProcess, cut_along
 from lathe_machine.plants.cutting_force import PAPER, REALISTIC, RIGID, Elasticity, Flank, SpecificForce, Wear
-from lathe_machine.plants.workpiece import HardSpot, Part
+from lathe_machine.plants.workpiece import HardSpot, Workpiece
 from lathe_machine.signals.allowance import Allowance, AllowanceTable, allow, mean_reverting, unbounded
 from lathe_machine.stages.common.tables import made_of
 from lathe_rc import messages
@@ -119,7 +119,7 @@ class CuttingProcessParameters(NodeParameters):
         support: Support = self.shaft
         return made_of(Shaft, self, "shaft_", support=support)
 
-    def part(self, node: str, prefix: str = "") -> Part:
+    def part(self, node: str, prefix: str = "") -> Workpiece:
         """Return the part of a node; ``prefix`` precedes its parameters in a composed table.
 
         Raises:
@@ -143,7 +143,7 @@ class CuttingProcessParameters(NodeParameters):
         with about(node, *(prefix + name for name in names[:-1])):
             hard_spots = [HardSpot(*spot) for spot in zip(*spots, strict=True)]
         with about(node, f"{prefix}gap_start", f"{prefix}gap_width"):
-            return Part(
+            return Workpiece(
                 radius=self.radius,
                 gaps=list(zip(self.gap_start, self.gap_width, strict=True)),
                 hard_spots=hard_spots,

@@ -71,7 +71,7 @@ def followed(takeover: TakeoverTable, command: Samples) -> Samples:
 
 
 @dataclass(frozen=True)
-class Limits:
+class MotionLimits:
     """Limits on the motion that a drive can follow."""
 
     stroke: float  #: largest displacement in either direction [m]
@@ -85,7 +85,7 @@ class Drive(Stage):
     announces = (LIMITED, FREE)
     _commands: Sequence[LimitedCommand] = ()
     _clippings: Sequence[Clipping] = ()  # clipping of further limited quantities
-    _limits: Limits | None = None  # only for a drive that follows the whole profile
+    _limits: MotionLimits | None = None  # only for a drive that follows the whole profile
     _retraction: OwnRetraction | None = None  # only for a drive that retracts the tool
 
     @abstractmethod
@@ -96,7 +96,7 @@ class Drive(Stage):
         """Responses of the displacement to a command in further states, by topic: as measured, and along a drift."""
         return {}
 
-    def limits(self) -> Mapping[str, Limits]:
+    def limits(self) -> Mapping[str, MotionLimits]:
         """Limits of the drive by state topic before remapping, for a drive that follows the whole profile."""
         return {"coarse/state": self._limits} if self._limits else {}
 

@@ -11,7 +11,7 @@ from lathe_machine.control.bounded import TakeoverTable
 from lathe_machine.control.limits import LimiterTable
 from lathe_machine.stages.common.command_limits import LimitedCommand, LimitedParameters, limited
 from lathe_machine.stages.common.sampled import Sampled, checked
-from lathe_machine.stages.drive.drive import Drive, Limits, OwnRetraction, RetractionParameters, followed
+from lathe_machine.stages.drive.drive import Drive, MotionLimits, OwnRetraction, RetractionParameters, followed
 from lathe_rc import messages
 from lathe_rc.analysis.cycle_factors import Response
 from lathe_rc.analysis.resonance_grid import NO_POLES
@@ -60,7 +60,7 @@ class SingleDrive(Drive):
     def __init__(self, name: str, parameters: PlantParameters) -> None:
         super().__init__(name, parameters)
         self._retraction = OwnRetraction(parameters, parameters.stroke)
-        self._limits = Limits(parameters.stroke, parameters.max_velocity, parameters.max_acceleration)
+        self._limits = MotionLimits(parameters.stroke, parameters.max_velocity, parameters.max_acceleration)
         self._commands = [LimitedCommand(name, parameters)]
         self._sensors = [Sensor(parameters.noise_rms, parameters.resolution, parameters.seed, name)]
         self.declare(

@@ -15,7 +15,7 @@ from lathe_machine.plants.tool_drive import Piezo, ToolDrive
 from lathe_machine.plants.tool_motion import MotionTable, advance
 from lathe_machine.stages.common.command_limits import LimitedCommand, limited
 from lathe_machine.stages.common.tables import ComposedParameters, made_of, prefixed
-from lathe_machine.stages.drive.drive import Drive, Limits, OwnRetraction, followed
+from lathe_machine.stages.drive.drive import Drive, MotionLimits, OwnRetraction, followed
 from lathe_machine.stages.drive.electrodynamic_actuator import ElectrodynamicActuatorParameters
 from lathe_machine.stages.drive.piezo_actuator import PiezoActuatorParameters, SetPoint, sum_up
 from lathe_rc import messages
@@ -124,7 +124,7 @@ class CoupledDrive(Drive):
     def _equip(self, coarse: ElectrodynamicActuatorParameters, fine: PiezoActuatorParameters | None) -> None:
         """Set limits, retraction, commands and sensors from the tables of the drives."""
         name, seed, self._coarse = self.name, self.shared.seed, coarse
-        self._limits = Limits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
+        self._limits = MotionLimits(coarse.stroke, coarse.max_velocity, coarse.max_acceleration)
         self._retraction = OwnRetraction(coarse, coarse.stroke, coarse.gain)
         self._commands = [LimitedCommand(name, coarse, "coarse" if fine else "")]
         # The machine itself rounds to the resolution of the coarse sensor; here that sensor only adds noise.

@@ -253,10 +253,10 @@ class Learner(Obedient):
                     found += [(state, drive) for state in drive.states().get(topic, ())]
         return found
 
-    def checked_loop(self, cell: WiredCell) -> "Loop":
+    def checked_loop(self, cell: WiredCell) -> "CheckedLoop":
         """Return the controller with the drives that it commands, at the speeds that the checks evaluate."""
         responses = [response for response, _ in self.learned(cell.stages.values())]
-        return Loop(self, responses, self.checked_speeds(*cell.speed_range))
+        return CheckedLoop(self, responses, self.checked_speeds(*cell.speed_range))
 
     def allowed_delay(self, cell: WiredCell) -> int | None:
         """Return the longest feedback delay [sample] that the cycle allows in a cell; None if unknown."""
@@ -373,7 +373,7 @@ def lag(response: Response) -> float:
     return float(-np.angle(value if value.real >= 0.0 else -value))
 
 
-class Loop(NamedTuple):
+class CheckedLoop(NamedTuple):
     """Learning controller with the drives that it commands.
 
     Attributes:

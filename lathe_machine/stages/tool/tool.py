@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le, MinLen
 from lathe_machine.signals.error_motion import add_motion
 from lathe_machine.signals.profile_table import Demand
 from lathe_machine.signals.tip_path import steepest_fall
-from lathe_machine.stages.drive.drive import Drive, Limits
+from lathe_machine.stages.drive.drive import Drive, MotionLimits
 from lathe_machine.stages.tool.form import Form, FormParameters, FormTable, ProfileStage, evaluate
 from lathe_rc import messages
 from lathe_rc.arrays import put
@@ -280,7 +280,7 @@ class Tool(Stage):
         return Memory(form, begin, drives, parameters.cross_slide, parameters.deflects, self._error_motion)
 
 
-def _check_demand(owner: str, drive: str, demand: Demand, limits: Limits, speed: float) -> None:
+def _check_demand(owner: str, drive: str, demand: Demand, limits: MotionLimits, speed: float) -> None:
     """Check that a drive can follow a profile at a speed [rad/s]."""
     for what, asked, allowed, unit in (
         ("stroke", demand.stroke * 1e6, limits.stroke * 1e6, "µm"),

@@ -20,7 +20,7 @@ Bytes = npt.NDArray[np.uint8]
 Places = npt.NDArray[np.uint64]
 
 
-class Found(NamedTuple):
+class FoundRecords(NamedTuple):
     """Records located in a section of a file.
 
     Attributes:
@@ -75,7 +75,7 @@ def _walk(data: Bytes, messages: Places, others: Places, alone: bool) -> tuple[i
     return count, further, place
 
 
-def walk(data: bytes | memoryview, *, alone: bool = False) -> Found:
+def walk(data: bytes | memoryview, *, alone: bool = False) -> FoundRecords:
     """Locate the records of a section; with ``alone``, only up to the first record that is not a message.
 
     Raises:
@@ -87,10 +87,10 @@ def walk(data: bytes | memoryview, *, alone: bool = False) -> Found:
     if further > MOST_ANNOUNCED:
         raise TooMuchError(f"more than {MOST_ANNOUNCED} schemas and channels")
     messages, others = np.empty((count, 4), np.uint64), np.empty((further, 3), np.uint64)
-    return Found(messages, others, _walk(array, messages, others, alone)[2])
+    return FoundRecords(messages, others, _walk(array, messages, others, alone)[2])
 
 
-def walk_whole(data: bytes) -> Found:
+def walk_whole(data: bytes) -> FoundRecords:
     """Locate the records of a chunk or of a section of a file; all of them must be complete.
 
     Raises:

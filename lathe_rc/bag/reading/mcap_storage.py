@@ -23,7 +23,7 @@ from lathe_rc.bag.reading.chunk_messages import HEAD, Places, walk_whole
 from lathe_rc.bag.reading.limits import MOST_ANNOUNCED, MOST_BYTES, MOST_METADATA, TooMuchError
 from lathe_rc.bag.reading.sound_records import MAGIC, Record, SoundRecords, parsed
 from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
-from lathe_rc.bag.reading.unpacking import Budget, read_chunk
+from lathe_rc.bag.reading.unpacking import ReadingBudget, read_chunk
 from lathe_rc.errors import shown
 
 _INDEX = struct.Struct("<QQQQI")  # chunk entry: first and last time, start, length, size of the offset map
@@ -42,7 +42,7 @@ class _Records(Span):
     length: int
     in_chunk: bool
 
-    def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
+    def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: ReadingBudget) -> Iterator[Batch]:
         """Yield the messages in batches, in order of log time."""
         with self.path.open("rb") as stream:
             stream.seek(self.start)
@@ -96,7 +96,7 @@ class _Mcap:
     def __init__(self, path: Path) -> None:
         self._path, self._size = path, path.stat().st_size
         self.storage = Storage()
-        self._budget = Budget(self._size)
+        self._budget = ReadingBudget(self._size)
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, ChannelRecord] = {}
         self._channel_sets: dict[bytes, frozenset[int]] = {}

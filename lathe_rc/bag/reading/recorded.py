@@ -9,7 +9,7 @@ import numpy as np
 
 from lathe_rc import messages
 from lathe_rc.bag import provenance
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.stream import check_next
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell.soundness import refuse_faults
@@ -57,7 +57,7 @@ class Recorded:
         InputError: ``names`` refers to a topic that the bag does not have.
     """
 
-    def __init__(self, source: Source, names: Mapping[str, str]) -> None:
+    def __init__(self, source: BagSource, names: Mapping[str, str]) -> None:
         self.path, self.namespace = source.path, provenance.namespace(source.about)
         self.source, self._names = source, dict(names)
         for name, topic in names.items():

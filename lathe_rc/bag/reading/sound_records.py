@@ -25,9 +25,9 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, Found, walk
+from lathe_rc.bag.reading.chunk_messages import BEFORE_DATA, HEAD, FoundRecords, walk
 from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_METADATA, MOST_TEXT, TooMuchError
-from lathe_rc.bag.reading.unpacking import CHUNK, Budget, read_chunk
+from lathe_rc.bag.reading.unpacking import CHUNK, ReadingBudget, read_chunk
 
 Parsed = TypeVar("Parsed")
 Told = Callable[[str, int], None]  #: given a description of the damage, and the bytes in which messages may be lost
@@ -97,7 +97,7 @@ class _Effort:
     """Remaining work allowed for a file: bytes to unpack, and pages to search for records."""
 
     def __init__(self, size: int) -> None:
-        self.budget = Budget(size)
+        self.budget = ReadingBudget(size)
         self.left = _PAGES + 2 * (size // _PAGE)
 
     def spend(self, size: int) -> bool:
@@ -131,7 +131,7 @@ class SoundRecords:
         self._checked_from = self.summary_start = self.data_end = size
         self.ended = self.data_wrong = self.summary_wrong = False
 
-    def inside(self, record: Record) -> Iterator[tuple[bytes, Found]]:
+    def inside(self, record: Record) -> Iterator[tuple[bytes, FoundRecords]]:
         """Yield the bytes and located records of a chunk or of messages; any other record is yielded as a whole."""
         if record.opcode == Opcode.CHUNK and not record.checked:
             inner = SoundRecords(BytesIO(record.content), len(record.content), self.told, self._effort)
@@ -362,12 +362,12 @@ def parsed(kind: type[Parsed], content: bytes) -> Parsed:
     return kind.read(ReadDataStream(BytesIO(content)))  # type: ignore[attr-defined, no-any-return]  # each has it
 
 
-def _found(record: Record, *walked: int) -> Found:
+def _found(record: Record, *walked: int) -> FoundRecords:
     """Return the records inside a record, or the record itself if its opcode is not in ``walked``."""
     if record.opcode in walked:
         return walk(record.content)
     size = len(record.content)
-    return Found(np.empty((0, 4), np.uint64), np.array([[record.opcode, 0, size]], np.uint64), size)
+    return FoundRecords(np.empty((0, 4), np.uint64), np.array([[record.opcode, 0, size]], np.uint64), size)
 
 
 def _as_written(opcode: int, content: bytes) -> bool:

@@ -30,7 +30,7 @@ from lathe_rc.bag.reading.metadata import Metadata, Topic
 from lathe_rc.bag.reading.seal import Seal
 from lathe_rc.bag.reading.sealed_metadata import compare
 from lathe_rc.bag.reading.storage import Batch, Message, Span, Storage
-from lathe_rc.bag.reading.unpacking import Budget, is_packed, unpack, unpack_file, unpacked_size
+from lathe_rc.bag.reading.unpacking import ReadingBudget, is_packed, unpack, unpack_file, unpacked_size
 from lathe_rc.blocks.block import Block
 from lathe_rc.blocks.wire import Decoder
 from lathe_rc.errors import InputError, LatheError, shown
@@ -100,7 +100,7 @@ def name_of(path: Path) -> str:
     return Path(os.path.abspath(path)).name  # noqa: PTH100 - resolve() fails on circular links
 
 
-class Source:
+class BagSource:
     """Bag opened for reading; a context manager.
 
     Args:
@@ -282,7 +282,7 @@ class Source:
         wrong += [(f"0 messages of {topic}", self.topics[topic].count) for topic in sorted(untold)]
         self.contradictions += [f"{metadata.NAME} says {said}; the files: {found}" for said, found in wrong]
 
-    def __enter__(self) -> "Source":
+    def __enter__(self) -> "BagSource":
         """Return the bag itself."""
         return self
 
@@ -365,7 +365,7 @@ class Source:
         """
         names = set(self.topics) if topics is None else topics & set(self.topics)
         start, stop = start_ns or 0, _NEVER if stop_ns is None else stop_ns
-        budget = Budget(self._size)
+        budget = ReadingBudget(self._size)
         reads: list[Read] = []
         for storage in self._storages:
             wanted = {
@@ -388,7 +388,7 @@ class Source:
             hint = _RECOVER if any(map(_readable, reads)) else ""
             raise InputError(f"{self.path}: broken ({_reason(error)}){hint}") from None
 
-    def _unpacked(self, batch: Batch, budget: Budget) -> Iterator[Batch]:
+    def _unpacked(self, batch: Batch, budget: ReadingBudget) -> Iterator[Batch]:
         """Unpack messages that are compressed individually, each to at most its stated size."""
         for topic, log_ns, data in batch:
             whole = unpack("zstd", data, unpacked_size(data[:18]))
@@ -414,7 +414,7 @@ def _overlapping(reads: Sequence[Read]) -> Iterator[list[Read]]:
         yield group
 
 
-def _merged(group: Sequence[Read], start: int, stop: int, budget: Budget) -> Iterator[Batch]:
+def _merged(group: Sequence[Read], start: int, stop: int, budget: ReadingBudget) -> Iterator[Batch]:
     """Merge the messages of overlapping spans by log time."""
     if len(group) == 1:
         ((span, wanted),) = group
@@ -462,6 +462,6 @@ def _readable(read: Read) -> bool:
     """Return whether a span has at least one readable message."""
     span, wanted = read
     try:
-        return any(span.read(wanted, 0, _NEVER, Budget(span.size)))
+        return any(span.read(wanted, 0, _NEVER, ReadingBudget(span.size)))
     except _WRONG:
         return False

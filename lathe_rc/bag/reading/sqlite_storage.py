@@ -15,7 +15,7 @@ import numpy as np
 
 from lathe_rc.bag.reading.limits import MOST_BYTES, MOST_TOPICS
 from lathe_rc.bag.reading.storage import Batch, Channel, Span, Storage
-from lathe_rc.bag.reading.unpacking import Budget
+from lathe_rc.bag.reading.unpacking import ReadingBudget
 from lathe_rc.errors import InputError, shown
 
 _LAST = 2**63 - 1  # largest integer in SQLite
@@ -92,7 +92,7 @@ class _Table(Span):
 
     path: Path
 
-    def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
+    def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: ReadingBudget) -> Iterator[Batch]:
         """Yield the messages one by one, in order of log time."""
         query = """SELECT topic_id, timestamp, CASE WHEN length(data) <= ? THEN data END FROM messages
             WHERE topic_id IN (SELECT value FROM json_each(?)) AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"""

@@ -11,7 +11,7 @@ from lathe_rc.bag.reading.chunk_messages import Places
 from lathe_rc.bag.reading.limits import MOST_TEXT, MOST_TOPICS
 from lathe_rc.bag.reading.metadata import check_name, qos_of_text
 from lathe_rc.bag.reading.seal import FileSeal
-from lathe_rc.bag.reading.unpacking import Budget
+from lathe_rc.bag.reading.unpacking import ReadingBudget
 
 Message = tuple[str, int, bytes]  #: topic, log time [ns] and bytes
 
@@ -116,7 +116,7 @@ class Span:
     size: int
     channels: frozenset[int]
 
-    def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: Budget) -> Iterator[Batch]:
+    def read(self, topics: Mapping[int, str], start_ns: int, stop_ns: int, budget: ReadingBudget) -> Iterator[Batch]:
         """Yield the messages in order of log time.
 
         Args:

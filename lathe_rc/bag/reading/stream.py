@@ -11,7 +11,7 @@ from typing import Any
 from lathe_rc import messages
 from lathe_rc.bag.loss import Loss
 from lathe_rc.bag.reading.chunk_messages import Places
-from lathe_rc.bag.reading.source import Source
+from lathe_rc.bag.reading.source import BagSource
 from lathe_rc.bag.reading.storage import Batch
 from lathe_rc.bag.snapshot import span_of
 from lathe_rc.blocks.block import Block
@@ -247,7 +247,7 @@ class SampleReader:
         first: index of the first sample to read.
     """
 
-    def __init__(self, source: Source, topic: str, first: int = 0) -> None:
+    def __init__(self, source: BagSource, topic: str, first: int = 0) -> None:
         self._dense = _Dense(topic, source.topics[topic].type, first)
         self._batches = source.batches({topic})
 
@@ -292,7 +292,7 @@ class From:
             self._sink.chunk(first + left, samples - left, late, told)
 
 
-def first_of(source: Source) -> int:
+def first_of(source: BagSource) -> int:
     """Return the first sample of all dense topics: not 0 in a snapshot, or if the recorder joined a running cell.
 
     It is that of the loss in a bag that only has samples from the loss of a member on.
@@ -323,7 +323,7 @@ def feed(path: Path, sinks: Iterable[Sink], *, piece: int = 65536, whole: bool =
         InputError: the path is not a bag.
         LatheError: samples are missing or repeated.
     """
-    with Source(path, whole=whole) as source:
+    with BagSource(path, whole=whole) as source:
         types = {topic: kind.type for topic, kind in source.topics.items()}
         loss = source.loss
         feeder = Feeder(types, sinks, piece, first_of(source), loss)

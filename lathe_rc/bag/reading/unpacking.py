@@ -17,7 +17,7 @@ _PIECE = 2**20  # size of the pieces in which a file is unpacked [B]
 CHUNK = struct.Struct("<QQQII")  #: first and last time, size, CRC, length of the compression's name
 
 
-class Budget:
+class ReadingBudget:
     """Budget of bytes and messages that files may still yield (see `limits`).
 
     Args:
@@ -88,7 +88,7 @@ def unpack_file(path: Path) -> Iterator[bytes]:
         ValueError: the content is longer than allowed.
         ZstdError: the file is damaged.
     """
-    budget = Budget(path.stat().st_size)
+    budget = ReadingBudget(path.stat().st_size)
     with path.open("rb") as stream:
         reader = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
         while piece := reader.read(_PIECE):

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from lathe_rc.bag.writing.rows import Dense, Plan, RowBuffer
-from lathe_rc.bag.writing.writer import Output
+from lathe_rc.bag.writing.writer import MessageSink
 from lathe_rc.blocks.block import Block
 from lathe_rc.errors import LatheError
 from lathe_rc.messages import START_NS, Samples, Signals
@@ -49,7 +49,7 @@ class Merger:
 
     def __init__(
         self,
-        writer: Output,
+        writer: MessageSink,
         dense: Mapping[str, tuple[str, str]],
         sparse: Mapping[str, str],
         *,

@@ -11,7 +11,7 @@ from lathe_rc import messages
 from lathe_rc.bag import provenance
 from lathe_rc.bag.snapshot import GONE_ON
 from lathe_rc.bag.writing.order import Merger
-from lathe_rc.bag.writing.writer import BagWriter, Both, Output, offered_qos
+from lathe_rc.bag.writing.writer import BagWriter, Both, MessageSink, offered_qos
 from lathe_rc.blocks.block import Framer
 from lathe_rc.blocks.ports import Sparse, signal_depth
 from lathe_rc.cell.recorder import RecorderParameters
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lathe_rc.bag.writing.snapshots import Snapshots
 
 
-def bag_of(path: Path, table: RecorderParameters, snapshots: "Snapshots | None") -> Output:
+def bag_of(path: Path, table: RecorderParameters, snapshots: "Snapshots | None") -> MessageSink:
     """Create the output of a recorder: the bag of the whole run (unless disabled), the snapshots, or both.
 
     Raises:
@@ -36,14 +36,14 @@ def bag_of(path: Path, table: RecorderParameters, snapshots: "Snapshots | None")
     return bag if snapshots is None else Both(bag, snapshots)
 
 
-def split(output: Output, duration: float) -> None:
+def split(output: MessageSink, duration: float) -> None:
     """Set the simulated time [s] after which the bag of a whole run goes on in another file; 0: one file."""
     bag = output.first if isinstance(output, Both) else output
     if isinstance(bag, BagWriter):
         bag.split_ns = round(duration * 1e9)
 
 
-def begin(path: Path, scenario: Scenario, snapshots: "Snapshots | None" = None) -> Output:
+def begin(path: Path, scenario: Scenario, snapshots: "Snapshots | None" = None) -> MessageSink:
     """Create the bag of an offline run of a scenario, with the settings of its recorder.
 
     Args:
@@ -92,7 +92,7 @@ class OfflineRecorder:
     """
 
     def __init__(
-        self, cell: Cell, samples: int, writer: Output, snapshots: "Snapshots | None" = None, first: int = 0
+        self, cell: Cell, samples: int, writer: MessageSink, snapshots: "Snapshots | None" = None, first: int = 0
     ) -> None:
         shared = cell.master.shared
         self._snapshots = snapshots

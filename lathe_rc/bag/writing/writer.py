@@ -69,7 +69,7 @@ class Topic(NamedTuple):
     channel: bytes
 
 
-class Output(Protocol):
+class MessageSink(Protocol):
     """Sink for the messages of a run: one bag, or a writer of several bags."""
 
     def tell(self, about: Mapping[str, str]) -> None:
@@ -396,7 +396,7 @@ class BagWriter:
 
 
 class Both:
-    """Pair of outputs with the same topics, both of which receive every message; an `Output`.
+    """Pair of outputs with the same topics, both of which receive every message; an `MessageSink`.
 
     Args:
         first: bag of the whole run.
@@ -406,7 +406,7 @@ class Both:
         first: see the arguments.
     """
 
-    def __init__(self, first: BagWriter, second: Output) -> None:
+    def __init__(self, first: BagWriter, second: MessageSink) -> None:
         self.first, self._second = first, second
 
     def tell(self, about: Mapping[str, str]) -> None:
