@@ -155,7 +155,8 @@ class BlockQueue(BlockOrder):
                 f"stamps the block from sample {block.first_index} on with {block.log_ns} ns; expected {stamp} ns, the "
                 "time of its last sample"
             )
-        if (run_end := self.run_end()) is not None and block.last != (end >= run_end):
+        run_end = self.run_end()
+        if run_end is not None and (block.last != (end >= run_end) or end > run_end):
             return f"{'ends the run at' if block.last else 'goes on after'} sample {end}; it ends at {run_end}"
         return ""
 

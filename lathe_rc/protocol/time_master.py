@@ -81,7 +81,7 @@ class TimeMasterProtocol(MemberProtocol):
         self.running = False
         self.unsafe: frozenset[str] = frozenset()
         self.completed = {name: 0 for name in own.members if name != own.name}
-        self.ends_early = False
+        self.ends_early, self._asked = False, ""  # and why an operator has asked for it
         self.held_at: int | None = None
         self.starved = False
         self.latency = Durations()
@@ -287,6 +287,7 @@ class TimeMasterProtocol(MemberProtocol):
         A run with a planned end fails after it, since it has not come to this end.
         """
         planned, self.ends_early, self.active, self.held_at, self._heard = self.end, True, True, None, now
+        self._asked = why
         end = self.samples + self._reactions.block_size
         if self._declared or self.cut or (planned is not None and end >= planned):
             self.actions.append(do.Release())
@@ -337,7 +338,7 @@ class TimeMasterProtocol(MemberProtocol):
         if self.ends_early and now - self._heard > GIVEN_UP:
             waits = self._room <= 0 or self.blocks == self.blocks_in_run
             stuck = f"{self.slowest} has not completed its blocks" if waits else "its last block was not sent"
-            self.fail(LatheError(f"{self.cut or self._why}; {stuck} within {GIVEN_UP:g} s"))
+            self.fail(LatheError(f"{self.cut or self._why or self._asked}; {stuck} within {GIVEN_UP:g} s"))
             return
         for name in [each for each in self.completed if each in self.ended and each not in self._dead]:
             restarts, self.patience = self.restarts(name) and not self._declared, _GONE

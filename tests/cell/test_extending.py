@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import own_spindle
 import pytest
 from bags import lathe
 from machines import line_of
 
+import own_spindle
 from lathe_bagtools import hosts
 from lathe_rc import extensions, harness
 from lathe_rc.cell import scenario

@@ -29,10 +29,10 @@ def queue(**parameters) -> BlockQueue:
     return made
 
 
-def block(first, *, run_id="run", source="/spindle", step_ns=15_625, angle=None, size=SIZE) -> bytes:
+def block(first, *, run_id="run", source="/spindle", step_ns=15_625, angle=None, size=SIZE, last=False) -> bytes:
     signals = messages.allocate(messages.ENCODER, size)
     signals["angle"][:] = np.arange(first, first + size) if angle is None else angle
-    return Encoder(messages.ENCODER, run_id, source, step_ns).encode(first, signals, last=False, companions=0)[1]
+    return Encoder(messages.ENCODER, run_id, source, step_ns).encode(first, signals, last=last, companions=0)[1]
 
 
 def late(data) -> bytes:
@@ -167,6 +167,23 @@ def test_too_many_foreign_messages_are_counted_together_and_told_once():
     assert len(told) == len(strangers.senders) - 1 == 32
     assert sum(strangers.senders.values()) == 2000
     assert len(str(strangers)) < 32 * 400
+
+
+@pytest.mark.parametrize(
+    ("end", "last", "words"),
+    [
+        (12, True, "ends the run at sample 8; it ends at 12"),
+        (6, True, "ends the run at sample 8"),
+        (8, False, "goes on"),
+    ],
+)
+def test_a_block_ends_the_run_where_the_cell_says(end, last, words):
+    """Also one that goes beyond it: a reader of a free-running cell ran on with it."""
+    taken = queue()
+    taken.run_end = lambda: end
+    taken.add(block(0))
+    with pytest.raises(BadBlock, match=words):
+        taken.add(block(4, last=last))
 
 
 @pytest.mark.parametrize(("second", "words"), [(0, "a block came twice"), (8, "4 samples are missing")])

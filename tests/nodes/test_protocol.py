@@ -385,6 +385,17 @@ def test_a_hold_does_not_change_an_early_end(blocks):
     assert protocol.credit > 0, "then the last block follows"
 
 
+def test_a_run_that_is_ended_in_its_last_block_says_why_it_waits():
+    protocol = leads(stall_reaction="wait")
+    protocol.know_end(8)
+    release(protocol, 1)
+    protocol.end_run("/spindle was ended by SIGTERM", 0.0)
+    release(protocol, 1)
+    for now in np.arange(0.05, 2.2, 0.05).tolist():
+        protocol.look(now, {}, ())
+    assert str(protocol.failure).startswith("/spindle was ended by SIGTERM; /c has not completed its blocks within")
+
+
 @pytest.mark.parametrize("waits", ["for its own input", "for a report"])
 def test_a_silent_member_is_lost_although_the_window_is_not_used_up(waits):
     """A time master in a chain with a controller waits for the feedback of the member, shorter than the window."""

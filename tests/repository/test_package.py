@@ -11,11 +11,11 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import own_spindle
 import pytest
 import setuptools
 from lacking import write_site
 
+import own_spindle
 from lathe_rc import extras
 from lathe_rc.catalogue import COMMANDS_OF, OURS
 
