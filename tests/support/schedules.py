@@ -333,8 +333,10 @@ def hanging(cell: Simulation) -> list[str]:
     everyone, _, lost = _outcome(cell)
     if not (cell.culprits or lost or cell.loses):
         failed = [(each.identity, str(each.protocol.failure)) for each in everyone if each.protocol.exit_code]
-        # A member may leave in the instant in which the run begins.
-        found += [f"{name}: {why}" for name, why in failed if not any(gone in why for gone in cell.killed)]
+        # A member may leave in the instant in which the run begins; some then hear of the time master's end alone.
+        gone = [name for name in cell.killed if any(name in why for _, why in failed)]
+        gone += [cell.master] * bool(gone)
+        found += [f"{name}: {why}" for name, why in failed if not any(name in why for name in gone)]
         recorders = [each for each in everyone if each.design.records and each.role.blocks == cell.length]
         if not recorders and not cell.killed:
             found.append("no recorder has every block")
