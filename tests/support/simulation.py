@@ -486,7 +486,7 @@ class Stage(StageRun):
     # ---- blocks
 
     def lose(self, lost: frozenset[str], first: int, end: int, *, again: bool) -> None:
-        if not again and self.samples > first:
+        if not again and self.samples > first and self.node.full_name not in self.sim.culprits:
             self.sim.overrun = f"{self.node.identity} hears of the safe state after its first sample"
         super().lose(lost, first, end, again=again)
 
