@@ -629,7 +629,8 @@ class MemberProtocol:
     @property
     def others_go_on(self) -> bool:
         """Return True if this member has failed while the others may still be on their way to the safe state."""
-        return bool(self.failure) and self.ready and self.master is not None and self.master.name != self.own.name
+        takes_part = self.ready or self.phase == Phase.SAFE  # one that left as the run began does not end its process
+        return bool(self.failure) and takes_part and self.master is not None and self.master.name != self.own.name
 
     def complete_part(self) -> None:
         """Complete this member's part; it stays until the cell has ended, or until its messages are acknowledged.
