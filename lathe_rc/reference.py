@@ -10,9 +10,10 @@ from importlib.resources import files
 from lathe_rc import messages
 from lathe_rc.blocks.ports import Input, signal_depth
 from lathe_rc.cell.beside import BESIDE
-from lathe_rc.cell.host_topics import HOST_TOPICS, MEMBERS
-from lathe_rc.cell.kinds import STAGES
+from lathe_rc.cell.host_topics import HOST_TOPICS, MASTER, MEMBER
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.parameters import NodeParameters, ParameterRow, SharedParameters
+from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.cell.stage import Stage
 
@@ -139,16 +140,15 @@ def _edge(port: Input) -> str:
 
 
 def _host() -> str:
-    def who(kinds: Sequence[str]) -> str:
-        return "all nodes" if kinds == MEMBERS else ", ".join(f"`{kind}`" for kind in kinds) or "nobody in the cell"
-
+    masters = ", ".join(f"`{kind}`" for kind in MASTERS)
+    told = {MEMBER: "all nodes", MASTER: masters, RECORDER: f"`{RECORDER}`", "": "nobody in the cell"}
     rows = [
         [
             f"`{topic.name}`",
             f"`{topic.type}`",
             f"reliable, depth {topic.depth}, {topic.durability}",
-            who(topic.publishers),
-            who(topic.subscribers),
+            told[topic.publisher],
+            told[topic.subscriber],
             topic.doc,
         ]
         for topic in HOST_TOPICS

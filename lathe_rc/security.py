@@ -14,8 +14,7 @@ from pathlib import Path
 from lathe_rc import harness
 from lathe_rc.catalogue import DRAWN
 from lathe_rc.cell.beside import MACHINE_STATE, PANEL, PANEL_COMMANDS, REPLAYER, RERUN_BRIDGE, TOPIC_RECORDER
-from lathe_rc.cell.host_topics import HOST_TOPICS, MEMBERS
-from lathe_rc.cell.kinds import MASTERS
+from lathe_rc.cell.host_topics import HOST_TOPICS, MASTER, MEMBER
 from lathe_rc.cell.parameters import remapped
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.cell.scenario import Scenario
@@ -99,12 +98,9 @@ class _Maker:
         if stage:
             services.append("schedule")
         masters = set(self._scenario.masters)
-
-        def among(kinds: Sequence[str]) -> bool:  # stages of others are members, and may be time masters, as well
-            return kinds == MEMBERS or (name in masters if kinds == MASTERS else kind in kinds)
-
-        told = {topic.name for topic in HOST_TOPICS if among(topic.publishers)}
-        heard = {topic.name for topic in HOST_TOPICS if among(topic.subscribers)}
+        roles = {MEMBER, kind, *([MASTER] if name in masters else [])}
+        told = {topic.name for topic in HOST_TOPICS if topic.publisher in roles}
+        heard = {topic.name for topic in HOST_TOPICS if topic.subscriber in roles}
         watched = set(self._scenario.nodes) - masters if name in masters else masters
         heard |= {remapped(stage.shared, topic) for topic in stage.foreign} if stage else set()
         heard |= {f"{other}/{ALIVE}" for other in watched - set(group)}

@@ -3,7 +3,6 @@
 
 from typing import NamedTuple
 
-from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.recorder import KIND as RECORDER
 from lathe_rc.messages import PACKAGE
 
@@ -16,8 +15,8 @@ class HostTopic(NamedTuple):
         type: message type.
         depth: queue length that publishers offer.
         durability: ``transient local`` (late readers receive the newest messages), or ``volatile``.
-        publishers: kinds of node that publish it.
-        subscribers: kinds of node that read it.
+        publisher: role of the nodes that publish it.
+        subscriber: role of the nodes that read it; empty: none in the cell.
         doc: purpose of the topic.
     """
 
@@ -25,25 +24,25 @@ class HostTopic(NamedTuple):
     type: str
     depth: int
     durability: str
-    publishers: tuple[str, ...]
-    subscribers: tuple[str, ...]
+    publisher: str
+    subscriber: str
     doc: str
 
 
-MEMBERS = (*STAGES.own, RECORDER)  #: kinds of node that take part in a cell
+MEMBER, MASTER = "member", "time master"  #: roles of nodes, beside that of the recorder: every one is a member
 _MEMBER, _STATE, _PROGRESS = (f"{PACKAGE}/msg/{name}" for name in ("Member", "CellState", "Progress"))
 _DIAGNOSTICS, _CLOCK = "diagnostic_msgs/msg/DiagnosticArray", "rosgraph_msgs/msg/Clock"
 _LATCHED = "transient local"
 HOST_TOPICS = (
-    HostTopic("members", _MEMBER, 1, _LATCHED, MEMBERS, MEMBERS, "who takes part, and who is ready"),
-    HostTopic("cell_state", _STATE, 1, _LATCHED, MASTERS, MEMBERS, "start, end, safe state and failure of the run"),
+    HostTopic("members", _MEMBER, 1, _LATCHED, MEMBER, MEMBER, "who takes part, and who is ready"),
+    HostTopic("cell_state", _STATE, 1, _LATCHED, MASTER, MEMBER, "start, end, safe state and failure of the run"),
     HostTopic(
-        *("progress", _PROGRESS, 1, _LATCHED, MEMBERS, MASTERS),
+        *("progress", _PROGRESS, 1, _LATCHED, MEMBER, MASTER),
         "how far each member has come: the credit of the window",
     ),
     HostTopic(
-        *("/diagnostics", _DIAGNOSTICS, 100, "volatile", MEMBERS, (RECORDER,)),
+        *("/diagnostics", _DIAGNOSTICS, 100, "volatile", MEMBER, RECORDER),
         "state and counters of each node, once a second",
     ),
-    HostTopic("/clock", _CLOCK, 10, "volatile", MASTERS, (), "simulated time of the slowest member"),
+    HostTopic("/clock", _CLOCK, 10, "volatile", MASTER, "", "simulated time of the slowest member"),
 )

@@ -29,7 +29,6 @@ Positive = Annotated[float, Gt(0)]  #: quantities that are used as divisors
 
 Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
 Values = Mapping[str, Value]  #: values by parameter name
-Off = dict[str, dict[str, Value]]  #: values that switch causes of a form error off, by cause and NODE.PARAM
 
 T = TypeVar("T", bound="Table")
 
@@ -342,8 +341,8 @@ class NodeParameters(SharedParameters):
         """Return the values of the node that other nodes may use, by parameter name."""
         return {}
 
-    def causes_off(self, node: str, nodes: Mapping[str, "NodeParameters"], height: Samples) -> Off:
-        """Return the values that switch further causes of a form error off, by cause and NODE.PARAM.
+    def causes_off(self, node: str, nodes: Mapping[str, "NodeParameters"], height: Samples) -> dict[str, Values]:
+        """Return the values of the node that switch further causes of a form error off, by cause.
 
         Args:
             node: name of the node.

@@ -189,10 +189,10 @@ class Stage(ABC):
                 )
 
     def causes_off(self, cell: WiredCell) -> dict[str, Values | str]:
-        """Return the values that switch causes of a form error off, which depend on the wired cell.
+        """Return the values of the stage that switch causes of a form error off, which depend on the wired cell.
 
         Returns:
-            By cause, the values by NODE.PARAM, or the reason for which nothing switches it off.
+            By cause, the values, or the reason for which nothing switches it off.
         """
         return {}
 

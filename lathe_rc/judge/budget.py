@@ -12,7 +12,7 @@ from lathe_rc.analysis.metrology import evenly
 from lathe_rc.analysis.tolerance import LAST, growth
 from lathe_rc.blocks.ports import Sparse
 from lathe_rc.cell import batch
-from lathe_rc.cell.parameters import Off, Value, Values
+from lathe_rc.cell.parameters import Value, Values
 from lathe_rc.cell.scenario import Scenario, of_load
 from lathe_rc.cell.wiring import Cell
 from lathe_rc.errors import InputError, LatheError
@@ -111,17 +111,17 @@ def _simple(scenario: Scenario) -> dict[str, Cause]:
 def _of_cell(scenario: Scenario, height: Samples) -> tuple[dict[str, Cause], dict[str, str]]:
     """Return the causes that nodes and stages find in this cell; and those that stay, with the reasons."""
     cell = Cell(scenario.nodes)
-    off: Off = {name: {} for name in _FIRST}
+    found: list[tuple[str, Mapping[str, Values | str]]] = []
+    found += [(node, stage.causes_off(cell)) for node, stage in cell.stages.items()]
+    found += [(node, table.causes_off(node, scenario.nodes, height)) for node, table in scenario.nodes.items()]
+    off: dict[str, dict[str, Value]] = {name: {} for name in _FIRST}
     left_out: dict[str, str] = {}
-    for stage in cell.stages.values():
-        for name, values in stage.causes_off(cell).items():
+    for node, each in found:
+        for name, values in each.items():
             if isinstance(values, str):
                 left_out[name] = values
             else:
-                off.setdefault(name, {}).update(values)
-    for node, table in scenario.nodes.items():
-        for name, each in table.causes_off(node, scenario.nodes, height).items():
-            off.setdefault(name, {}).update(each)
+                off.setdefault(name, {}).update({f"{node}.{parameter}": value for parameter, value in values.items()})
     return {name: Cause(off[name], _NEEDS.get(name, "")) for name in off if name not in left_out}, left_out
 
 

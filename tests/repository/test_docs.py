@@ -15,8 +15,8 @@ from click.testing import CliRunner
 
 from lathe_rc import __version__, cli, reference
 from lathe_rc.catalogue import OURS
-from lathe_rc.cell.host_topics import HOST_TOPICS, HostTopic
-from lathe_rc.cell.kinds import STAGES
+from lathe_rc.cell.host_topics import HOST_TOPICS, MASTER, MEMBER, HostTopic
+from lathe_rc.cell.kinds import MASTERS, STAGES
 from lathe_rc.cell.scenario import TABLES
 from lathe_rc.commands.run import run
 from lathe_rc.messages import PACKAGE, store
@@ -102,8 +102,9 @@ class TestHostTopics:
         for kind, node in nodes.items():
             outlets = [outlet for outlet in node.publishers if outlet.topic_name == full]
             read = {inlet.topic_name for inlet in node.subscriptions}
-            assert bool(outlets) == (kind in topic.publishers), f"{kind} publishes {full}"
-            assert (full in read) == (kind in topic.subscribers), f"{kind} reads {full}"
+            roles = {MEMBER, kind, *([MASTER] if kind in MASTERS else [])}
+            assert bool(outlets) == (topic.publisher in roles), f"{kind} publishes {full}"
+            assert (full in read) == (topic.subscriber in roles), f"{kind} reads {full}"
             for outlet in outlets:
                 package, qos = outlet.msg_type.__module__.partition(".")[0], outlet.qos_profile
                 assert f"{package}/msg/{outlet.msg_type.__name__}" == topic.type

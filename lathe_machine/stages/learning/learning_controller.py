@@ -128,9 +128,7 @@ class LearningController(Learner):
         """Return the cause ``Q floor``: Q is below 1. Off: it is 1 as far as the channel then converges."""
         loop = self.checked_loop(cell)
         flat = loop.flat(min(max(loop.factor({}), _FLAT), _CONVERGES))
-        if flat is None:
-            return {"Q floor": f"{self.name} converges with no flat Q"}
-        return {"Q floor": {f"{self.name}.{name}": value for name, value in flat.items()}}
+        return {"Q floor": f"{self.name} converges with no flat Q" if flat is None else flat}
 
     @property
     def correction(self) -> Correction:

@@ -14,7 +14,7 @@ from lathe_machine.control.q_filter import Exponential, Gaussian, LowPass, Movin
 from lathe_machine.stages.learning.learner import LawParameters
 from lathe_machine.stages.spindle.speed_law import SpeedLawParameters
 from lathe_rc.cell import models
-from lathe_rc.cell.parameters import NodeParameters, NonNegative, Off, Positive, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, Values, about, parameter
 from lathe_rc.cell.time_master import TimeMasterParameters
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
@@ -125,20 +125,19 @@ class LearningControllerParameters(SpeedLawParameters, LawParameters):
 
     commanded_topic: ClassVar[str] = "coarse/command"
 
-    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> Off:
+    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> dict[str, Values]:
         """Return the causes ``model`` (of a correction, it differs from the drive), ``speed`` and ``lead``.
 
         The lead follows the speed; off: an exact preview of the speed (implements `NodeParameters.causes_off`).
         """
-        found: Off = {}
+        found: dict[str, Values] = {}
         if self.correction not in ("none", "lead_lag", "fir"):
-            found["model"] = {f"{node}.{name}": value for name, value in models.of_drives(node, nodes).items()}
+            found["model"] = models.of_drives(node, nodes)
         for law in nodes.values():
             if isinstance(law, TimeMasterParameters) and isinstance(law, SpeedLawParameters) and law.varies:
-                followed = {name: getattr(law, name) for name in self.steady()}
-                followed |= {"law": "angle_domain", "lead_law": "exact_preview"}
-                found["speed"] = {f"{node}.{name}": value for name, value in self.steady().items()}
-                found["lead"] = {f"{node}.{name}": value for name, value in followed.items()}
+                found["speed"] = steady = self.steady()
+                followed = {name: getattr(law, name) for name in steady}
+                found["lead"] = followed | {"law": "angle_domain", "lead_law": "exact_preview"}
         return found
 
     @property

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 from lathe_machine.signals.deviation_law import DeviationLaw, tabulated
 from lathe_machine.stages.common.tables import made_of
 from lathe_rc import resources
-from lathe_rc.cell.parameters import NodeParameters, NonNegative, Off, Positive, Values, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, Values, about, parameter
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
 from lathe_rc.messages import Samples
@@ -64,9 +64,9 @@ class SpeedLawParameters(NodeParameters):
         """Whether the speed is not constant."""
         return any(getattr(self, name) != value for name, value in self.steady().items())
 
-    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> Off:
+    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> dict[str, Values]:
         """Return the cause ``speed``: it varies (extends `NodeParameters`)."""
-        return {"speed": {f"{node}.{name}": value for name, value in self.steady().items()}} if self.varies else {}
+        return {"speed": self.steady()} if self.varies else {}
 
     def speed_law(self, node: str) -> speed.SpeedLaw:
         """Return the speed law of a node, the sum of all deviations.

@@ -19,7 +19,7 @@ from lathe_rc import messages, resources
 from lathe_rc.analysis.tolerance import DOUBTED
 from lathe_rc.arrays import put
 from lathe_rc.blocks.ports import Input, Joint, Output
-from lathe_rc.cell.parameters import NodeParameters, NonNegative, Off, Positive, Value, about, parameter
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Positive, Value, Values, about, parameter
 from lathe_rc.cell.stage import DONE, Fields, Reached, Stage
 from lathe_rc.errors import InputError
 from lathe_rc.extensions import Named, Registry, code_of_others
@@ -83,13 +83,12 @@ class FormParameters(NodeParameters):
         """Form of the part, for laws with feed-forward."""
         return {name: getattr(self, name) for name in FORM}
 
-    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> Off:
+    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> dict[str, Values]:
         """Return the cause ``feed``: the form changes along the part. Off: the tool stays at the middle height."""
         if self.part_revolutions or not np.ptp(height):
             return {}
         middle = max(float(height.min() + height.max()) / 2.0, 0.0)
-        off: dict[str, Value] = {"height_from": "feed", "feed": 0.0, "start_height": middle}
-        return {"feed": {f"{node}.{name}": value for name, value in off.items()}}
+        return {"feed": {"height_from": "feed", "feed": 0.0, "start_height": middle}}
 
     def form(self, node: str) -> Profile:
         """Return the profile of a node.

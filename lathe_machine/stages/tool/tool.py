@@ -17,7 +17,7 @@ from lathe_rc import messages
 from lathe_rc.arrays import put
 from lathe_rc.blocks.ports import Input, Joint, Output
 from lathe_rc.cell.judged import Judged
-from lathe_rc.cell.parameters import NodeParameters, NonNegative, Off, Value, parameter, remapped
+from lathe_rc.cell.parameters import NodeParameters, NonNegative, Value, Values, parameter, remapped
 from lathe_rc.cell.stage import DONE, Fields, Reached, Stage, WiredCell
 from lathe_rc.errors import InputError
 from lathe_rc.jit import kernel
@@ -94,7 +94,7 @@ class ToolParameters(FormParameters):
         heights = zip(self.zone_bottom, self.zone_top, strict=True) if self.zone_bottom else repeat((0.0, 0.0))
         return tuple(Zone(*of, *span) for of, span in zip(found, heights, strict=False))
 
-    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> Off:
+    def causes_off(self, node: str, nodes: Mapping[str, NodeParameters], height: Samples) -> dict[str, Values]:
         """Return the causes of a tool with a form of its own (extends `FormParameters`)."""
         return {} if self.reference == "topic" else super().causes_off(node, nodes, height)
 

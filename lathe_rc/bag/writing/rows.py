@@ -59,7 +59,7 @@ class Plan:
         layouts: layouts of the messages.
         places: byte offsets of the messages in a row.
         template: row in which all numbers and samples are 0, shape (bytes,).
-        rows: size and period of the rows for an `Output`.
+        rows: size and period of the rows for a `MessageSink`.
     """
 
     def __init__(self, topics: list[Dense], run_id: str, step_ns: int, samples: int) -> None:

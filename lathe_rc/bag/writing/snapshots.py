@@ -38,7 +38,7 @@ class _Item(NamedTuple):
 
 
 class Snapshots:
-    """Buffer of the latest messages, written to a bag at every trigger; an `Output` that expects bag order.
+    """Buffer of the latest messages, written to a bag at every trigger; a `MessageSink` that expects bag order.
 
     A trigger whose pre-trigger time overlaps or touches the newest snapshot extends that snapshot, so no sample is
     written twice, and at most one bag is open. A snapshot is closed as soon as no trigger can extend it any more.

@@ -396,7 +396,7 @@ class BagWriter:
 
 
 class Both:
-    """Pair of outputs with the same topics, both of which receive every message; an `MessageSink`.
+    """Pair of outputs with the same topics, both of which receive every message; a `MessageSink`.
 
     Args:
         first: bag of the whole run.
